@@ -1,0 +1,70 @@
+//! Copies boxes between buffers and extends a brick past the volume's edge by its border rule.
+
+use crate::grid::{AnyView, AnyViewMut, Border, Region, View, ViewMut, Voxel};
+
+/// Copies the common part of two boxes: `src` covers `src_box`, `dst` covers `dst_box`. Panics if the types differ.
+pub fn copy_common(src: AnyView, src_box: Region, dst: AnyViewMut, dst_box: Region) {
+    macro_rules! arms {
+        ($($v:ident),*) => {
+            match (src, dst) {
+                $((AnyView::$v(s), AnyViewMut::$v(d)) => copy(s, src_box, d, dst_box),)*
+                (s, d) => panic!("copying {} to {}", s.dtype(), d.dtype()),
+            }
+        };
+    }
+    arms!(U8, I8, U16, I16, U32, I32, F32, F64)
+}
+
+/// Typed form of [`copy_common`].
+pub fn copy<T: Voxel>(src: View<T>, src_box: Region, mut dst: ViewMut<T>, dst_box: Region) {
+    let common = src_box.clip(&dst_box);
+    if common.is_empty() {
+        return;
+    }
+    let n = common.shape();
+    let (s, d) = (src_box.offset_of(&common), dst_box.offset_of(&common));
+    for z in 0..n[0] {
+        for y in 0..n[1] {
+            let from = &src.row_at(s[0] + z, s[1] + y)[s[2]..s[2] + n[2]];
+            dst.row_at(d[0] + z, d[1] + y)[d[2]..d[2] + n[2]].copy_from_slice(from);
+        }
+    }
+}
+
+/// Fills `dst` (covering `dst_box`, which may stick out of the volume) from `src` (covering `src_box`, which holds every
+/// voxel that the rule asks for). `volume` is the whole volume; `outside` the stored value for [`Border::Constant`].
+/// Panics for [`Border::Clip`] if `dst_box` sticks out.
+pub fn extend<T: Voxel>(
+    src: View<T>,
+    src_box: Region,
+    mut dst: ViewMut<T>,
+    dst_box: Region,
+    volume: Region,
+    border: Border,
+    outside: T,
+) {
+    assert!(border != Border::Clip || volume.contains(&dst_box), "a clipped window has no voxels outside");
+    let n = dst_box.shape();
+    let index = |a: usize, i: usize| {
+        let global = dst_box.lo[a] + i as i64 - volume.lo[a];
+        border.source_index(global, volume.hi[a] - volume.lo[a]).map(|g| (g + volume.lo[a] - src_box.lo[a]) as usize)
+    };
+    let xs: Vec<Option<usize>> = (0..n[2]).map(|x| index(2, x)).collect();
+    for z in 0..n[0] {
+        for y in 0..n[1] {
+            let row = dst.row_at(z, y);
+            let (Some(sz), Some(sy)) = (index(0, z), index(1, y)) else {
+                row.fill(outside);
+                continue;
+            };
+            let from = src.row_at(sz, sy);
+            for (d, s) in row.iter_mut().zip(&xs) {
+                if let Some(s) = s {
+                    *d = from[*s];
+                } else {
+                    *d = outside;
+                }
+            }
+        }
+    }
+}

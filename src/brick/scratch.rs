@@ -1,0 +1,49 @@
+//! Working memory of one worker: grows to what the largest kernel asked for and is then reused.
+
+use crate::grid::Voxel;
+
+/// A grow-only, 64-byte-aligned arena. A kernel takes all that it needs in one call.
+#[derive(Default)]
+pub struct Scratch {
+    words: Vec<Line>,
+}
+
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Line([u8; 64]);
+
+impl Scratch {
+    pub fn new() -> Scratch {
+        Scratch::default()
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.words.capacity() * size_of::<Line>()
+    }
+
+    /// At least `bytes` bytes, aligned to 64, contents undefined (left over from the last use).
+    pub fn take(&mut self, bytes: usize) -> &mut [u8] {
+        let lines = bytes.div_ceil(64);
+        if self.words.len() < lines {
+            self.words = Vec::new(); // freed first: the old contents are not wanted
+            self.words.resize(lines, Line([0; 64]));
+        }
+        // SAFETY: `Line` is 64 plain bytes without padding.
+        unsafe { std::slice::from_raw_parts_mut(self.words.as_mut_ptr().cast(), lines * 64) }
+    }
+}
+
+/// Cuts `len` elements of `T` off the front of a scratch slice, aligned to 64 bytes, and returns them with the rest.
+/// Panics if the slice is too short: ask [`Scratch::take`] for the sum of [`padded`] sizes.
+pub fn cut<T: Voxel>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
+    let (head, tail) = bytes.split_at_mut(padded::<T>(len));
+    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
+    // SAFETY: aligned (just checked), long enough, and every bit pattern is a valid `Voxel`.
+    (unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }, tail)
+}
+
+/// Bytes that [`cut`] takes for `len` elements.
+pub const fn padded<T>(len: usize) -> usize {
+    (len * size_of::<T>()).div_ceil(64) * 64
+}

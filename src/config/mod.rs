@@ -1,0 +1,5 @@
+//! The configuration: text to typed values.
+
+pub mod model;
+
+pub use model::*;

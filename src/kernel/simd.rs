@@ -1,0 +1,74 @@
+//! Instruction sets, chosen at run time: one portable binary.
+//!
+//! Results never depend on the level: fused multiply-adds are written as `mul_add`, which a CPU without them computes
+//! in software, and no kernel lets the compiler reorder float arithmetic.
+
+/// Instruction sets with kernels of their own, least first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Level {
+    /// What every x86-64 (and any other architecture) has.
+    Baseline,
+    /// AVX2 with FMA.
+    Avx2,
+    /// AVX-512 F, BW, DQ, VL and VBMI.
+    Avx512,
+}
+
+impl Level {
+    /// The best level of this CPU.
+    pub fn detect() -> Level {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let avx512 = is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512vbmi");
+            if avx2 && avx512 {
+                return Level::Avx512;
+            }
+            if avx2 {
+                return Level::Avx2;
+            }
+        }
+        Level::Baseline
+    }
+
+    /// Every level that this CPU can run, least first.
+    pub fn available() -> Vec<Level> {
+        [Level::Baseline, Level::Avx2, Level::Avx512].into_iter().filter(|l| *l <= Level::detect()).collect()
+    }
+}
+
+/// Makes `fn name(level, args..)`, which runs the `#[inline(always)]` function `inner(args..)` compiled for that level:
+/// `multiversion! { pub fn name['a, T: Voxel](src: &'a [T], dst: &mut [T]) -> () = inner; }` (the brackets hold the
+/// generics and may be empty). The caller promises that the CPU has the level, which [`Level::detect`] and
+/// [`Level::available`] see to.
+#[macro_export]
+macro_rules! multiversion {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident [$($gen:tt)*] ($($arg:ident : $ty:ty),* $(,)?) -> $ret:ty = $inner:path;) => {
+        $(#[$meta])*
+        #[allow(clippy::too_many_arguments)]
+        $vis fn $name<$($gen)*>(level: $crate::kernel::simd::Level, $($arg: $ty),*) -> $ret {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+                #[allow(clippy::too_many_arguments)]
+                fn avx512<$($gen)*>($($arg: $ty),*) -> $ret { $inner($($arg),*) }
+                #[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+                #[allow(clippy::too_many_arguments)]
+                fn avx2<$($gen)*>($($arg: $ty),*) -> $ret { $inner($($arg),*) }
+                match level {
+                    // SAFETY: a `Level` above `Baseline` comes from `detect` or `available`, which asked the CPU.
+                    $crate::kernel::simd::Level::Avx512 => return unsafe { avx512($($arg),*) },
+                    // SAFETY: as above.
+                    $crate::kernel::simd::Level::Avx2 => return unsafe { avx2($($arg),*) },
+                    $crate::kernel::simd::Level::Baseline => {}
+                }
+            }
+            let _ = level;
+            $inner($($arg),*)
+        }
+    };
+}

@@ -1,0 +1,5 @@
+//! What each stage is: parameters with units and ranges, channels, reach, tolerance, the paper it follows. Touches no voxel.
+
+pub mod params;
+
+pub use params::*;

@@ -1,0 +1,63 @@
+//! What a stored volume is, apart from its voxels.
+
+use crate::grid::{Affine, DType, Shape};
+
+/// Facts about one volume, in `[z, y, x]` order. A 2-D image is `[1, y, x]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VolumeInfo {
+    pub shape: Shape,
+    pub dtype: DType,
+    /// Voxel size per axis in `unit`; 1 where the file says nothing. Always positive and finite.
+    pub spacing: [f64; 3],
+    /// UDUNITS name (`millimeter`, `micrometer`, ...); `None` where unknown, which forbids physical lengths.
+    pub unit: Option<String>,
+    /// Physical position of voxel 0 (see SPEC section 6: 0 where the direction matrix is not diagonal and positive).
+    pub origin: [f64; 3],
+    /// The file's own orientation, kept for NRRD and NIfTI outputs and recorded elsewhere.
+    pub orientation: Option<Orientation>,
+    /// Stored to scaled values.
+    pub affine: Affine,
+    /// Stored value of missing voxels.
+    pub nodata: Option<f64>,
+    /// Components (channels read with `"all"`); 1 for a scalar volume.
+    pub components: usize,
+    pub component_names: Vec<String>,
+    /// Storage chunks, `[z, y, x]`; `None` for formats that are read by plain rows.
+    pub chunk: Option<Shape>,
+    /// How the file stores it, for people: `NIfTI-1, gzip`, `Zarr v3, blosc`, ...
+    pub format: String,
+}
+
+/// Direction matrix and space of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Orientation {
+    /// World position = `matrix * [x, y, z, 1]` (three rows, x fastest first, as files have it), in `unit`s.
+    pub matrix: [[f64; 4]; 3],
+    /// Axes convention: `RAS` or `LPS` (what +x, +y, +z of the world mean), or the file's own word.
+    pub space: String,
+}
+
+impl VolumeInfo {
+    /// A scalar volume of which only shape and type are known.
+    pub fn plain(shape: Shape, dtype: DType, format: impl Into<String>) -> VolumeInfo {
+        VolumeInfo {
+            shape,
+            dtype,
+            spacing: [1.0; 3],
+            unit: None,
+            origin: [0.0; 3],
+            orientation: None,
+            affine: Affine::IDENTITY,
+            nodata: None,
+            components: 1,
+            component_names: Vec::new(),
+            chunk: None,
+            format: format.into(),
+        }
+    }
+
+    /// Total voxels of one component.
+    pub fn voxels(&self) -> usize {
+        self.shape.iter().product()
+    }
+}

@@ -1,0 +1,11 @@
+//! Boxes of voxels from and to files. The only folder that names zarrs and memmap2.
+
+pub mod info;
+pub mod layout;
+pub mod sink;
+pub mod source;
+
+pub use info::VolumeInfo;
+pub use layout::{LevelLayout, Pyramid};
+pub use sink::{Sink, SinkSpec};
+pub use source::Source;
