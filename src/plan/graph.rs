@@ -45,6 +45,23 @@ pub struct Wire {
     pub halo: [usize; 3],
 }
 
+impl Wire {
+    /// The stored value beyond the edge of the volume for a constant border, and whether this wire's type cannot hold it
+    /// (the window then runs on floats).
+    pub fn beyond(&self, border: Border) -> (f64, bool) {
+        let Border::Constant(v) = border else { return (0.0, false) };
+        let stored = self.affine.invert(v);
+        let (lo, hi) = self.dtype.range();
+        let whole = stored.fract() == 0.0 && (lo..=hi).contains(&stored);
+        (stored, !self.dtype.is_float() && (!whole || self.missing == Some(stored as i64)))
+    }
+
+    /// Element type of the scaled values, with NaN for missing voxels where there may be any.
+    pub fn scaled_dtype(&self) -> DType {
+        if self.affine.is_identity() && self.missing.is_none() { self.dtype } else { self.dtype.result() }
+    }
+}
+
 /// A stage's mask, prepared.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mask {

@@ -182,11 +182,7 @@ impl Lowering<'_> {
             return Ok(());
         }
         let node = self.config.stages[index].clone();
-        let located = |e: Error| e.located(&self.config.file, node.place.line);
-        let config_file = self.config.file.clone();
-        self.lower_op(index, &node, &wanted).map_err(|e| e.located(&config_file, node.place.line)).map_err(|e| e)?;
-        let _ = located;
-        Ok(())
+        self.lower_op(index, &node, &wanted).map_err(|e| e.located(&self.config.file, node.place.line))
     }
 
     fn lower_op(&mut self, index: usize, node: &StageNode, wanted: &[&'static str]) -> Result<()> {
@@ -488,8 +484,9 @@ impl Lowering<'_> {
             "vector" => (3, ["z", "y", "x"].map(String::from).to_vec()),
             _ => (most, src.component_names.clone()),
         };
-        let extreme = matches!(channel, "min" | "max") && matches!(node.op, Op::Box { .. });
-        let dtype = if extreme && src.affine.is_identity() {
+        let extreme = matches!(channel, "min" | "max") && matches!(node.op, Op::Box { .. }) && src.affine.is_identity();
+        let extreme = extreme && !src.beyond(node.border).1;
+        let dtype = if extreme {
             src.dtype
         } else {
             inputs.iter().fold(DType::F32, |d, &w| {
@@ -497,7 +494,7 @@ impl Lowering<'_> {
             })
         };
         let dtype = if matches!(node.op, Op::Obscurance(_)) { DType::F32 } else { dtype };
-        let missing = if extreme && src.affine.is_identity() { src.missing } else { None };
+        let missing = if extreme { src.missing } else { None };
         let wire = Wire {
             name: format!("{}.{channel}", node.name),
             channel: channel.to_string(),
