@@ -149,7 +149,8 @@ mod tests {
 
     fn hostile(dtype: DType, n: usize) -> Voxels {
         let (lo, hi) = dtype.range();
-        let mut values = vec![0.0, -0.0, 1.0, 0.5, 1.5, 2.5, -0.5, 254.5, 255.0, 65534.5, lo, hi, 1e-300, 0.1, 127.0, -1.0];
+        let mut values =
+            vec![0.0, -0.0, 1.0, 0.5, 1.5, 2.5, -0.5, 254.5, 255.0, 65534.5, lo, hi, 1e-300, 0.1, 127.0, -1.0];
         if dtype.is_float() {
             values.extend([f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e30, -1e30, 4294967295.5, 2147483646.5]);
         }
@@ -202,11 +203,7 @@ mod tests {
         let mut codes = vec![0u16; values.len()];
         let shape = [1, 1, values.len()];
         let unit = Mapping { range: Some([0.0, 1.0]), fill: 0.0 };
-        convert(
-            AnyView::F32(View::dense(&values, shape)),
-            unit,
-            AnyViewMut::U16(ViewMut::dense(&mut codes, shape)),
-        );
+        convert(AnyView::F32(View::dense(&values, shape)), unit, AnyViewMut::U16(ViewMut::dense(&mut codes, shape)));
         for (v, c) in values.iter().zip(&codes) {
             assert_eq!(*c as f64, (*v as f64 * 65535.0).round_ties_even(), "{v}");
         }
