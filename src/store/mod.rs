@@ -4,8 +4,10 @@ pub mod info;
 pub mod layout;
 pub mod sink;
 pub mod source;
+pub mod spill;
 
 pub use info::VolumeInfo;
 pub use layout::{LevelLayout, Pyramid};
 pub use sink::{Sink, SinkSpec};
 pub use source::Source;
+pub use spill::Spill;
