@@ -28,6 +28,17 @@ pub struct Place {
     /// Dotted key, e.g. `stage.ao`.
     pub key: String,
     pub line: Option<usize>,
+    /// Lines of its keys, where they are given in the file.
+    pub lines: Vec<(String, usize)>,
+}
+
+impl Place {
+    /// A config error at `key` of this thing (`""`: at the thing itself). The file is added by [`crate::Error::located`].
+    pub fn error(&self, key: &str, message: impl std::fmt::Display) -> crate::Error {
+        let line = self.lines.iter().find(|(k, _)| k == key).map(|(_, line)| *line).or(self.line);
+        let dotted = if key.is_empty() { self.key.clone() } else { format!("{}.{key}", self.key) };
+        crate::Error::Config { file: None, line, key: dotted, message: message.to_string() }
+    }
 }
 
 #[derive(Debug, Clone)]
