@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use super::graph::*;
 use super::{Prepass, PrepassKind, lengths};
-use crate::config::{AoRegion, Config, Input, Modulation, Op, Place, Ref, StageNode, Where, WhereRule, op_channels, op_inputs};
+use crate::config::{AoRegion, Config, Input, Modulation, Op, Place, Ref, StageNode, Where, WhereRule, op_channels};
 use crate::grid::{Affine, Border, DType};
 use crate::kernel::{gaussian, mask, obscurance};
 use crate::stage::{GradientWeight, Method, WindowChannel, WindowParams, WindowShape};
@@ -73,7 +73,7 @@ impl Lowered {
     pub fn wire_of(&self, config: &Config, reference: &Ref) -> Option<WireId> {
         let name = match config.stages.iter().find(|s| s.name == reference.name) {
             Some(stage) => {
-                let channel = reference.channel.as_deref().unwrap_or(op_channels(&stage.op)[0]);
+                let channel = reference.channel.as_deref().unwrap_or(op_channels(stage.op.word())[0]);
                 format!("{}.{channel}", stage.name)
             }
             None => reference.name.clone(),
@@ -94,7 +94,7 @@ impl Lowering<'_> {
         let Some(stage) = self.config.stages.iter().position(|s| s.name == reference.name) else {
             return Err(self.error(place, format!("there is no input or stage named \"{}\"", reference.name)));
         };
-        let channels = op_channels(&self.config.stages[stage].op);
+        let channels = op_channels(self.config.stages[stage].op.word());
         let wanted = reference.channel.as_deref().unwrap_or(channels[0]);
         match channels.iter().find(|c| **c == wanted) {
             Some(channel) => Ok(Target::Stage(stage, channel)),
@@ -113,13 +113,13 @@ impl Lowering<'_> {
             self.wanted[stage].push(channel);
         }
         // Levels of a variance pool the means as well.
-        let companion = ["variance", "std"].contains(&channel) && op_channels(&self.config.stages[stage].op).contains(&"mean");
+        let companion = ["variance", "std"].contains(&channel) && op_channels(self.config.stages[stage].op.word()).contains(&"mean");
         if companion && !self.wanted[stage].contains(&"mean") {
             self.wanted[stage].push("mean");
         }
         if first {
             let node = &self.config.stages[stage];
-            for input in op_inputs(&node.op).into_iter().chain(node.where_.as_ref().map(|w| &w.input)) {
+            for (_, input) in node.reads() {
                 self.want(input, &node.place)?;
             }
         }

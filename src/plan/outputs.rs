@@ -158,7 +158,7 @@ fn map_output(config: &Config, infos: &[VolumeInfo], lowered: &Lowered, index: u
     if output.reduce.is_some() {
         return Err(Error::config(key("reduce"), "an occlusion map's levels are its own chain; leave `reduce` out"));
     }
-    let channels = op_channels(&config.stages[stage].op);
+    let channels = op_channels(config.stages[stage].op.word());
     let named = |r: &crate::config::Ref| r.channel.clone().unwrap_or_else(|| channels[0].to_string());
     let names: Vec<String> = output.from.iter().map(named).collect();
     let moments = names.iter().map(|n| usize::from(n == "variance")).collect();
