@@ -11,8 +11,9 @@ use occlude::brick::{Scratch, Voxels};
 use occlude::grid::{Affine, AnyView, DType, Shape, Voxel};
 use occlude::kernel::Context;
 use occlude::kernel::gradient::{GradientOut, gradient};
+use occlude::kernel::rank::rank;
 use occlude::kernel::simd::Level;
-use occlude::stage::GradientWeight;
+use occlude::stage::{GradientWeight, Ties, WindowParams, WindowShape};
 
 /// Voxels of the output box: rows as a brick of the planner has them.
 const BOX: Shape = [64, 64, 256];
@@ -28,6 +29,9 @@ fn main() {
                 report(&name, copy, &mut job);
             }
         };
+        for (window, radius) in [(WindowShape::Box, 5), (WindowShape::Box, 10), (WindowShape::Ball, 5)] {
+            row(format!("rank {window:?} radius {radius}"), rank_job(dtype, window, radius));
+        }
         for size in [3, 5] {
             row(format!("gradient {size}^3 magnitude"), gradient_job(dtype, size));
         }
@@ -117,5 +121,12 @@ fn gradient_job<'a>(dtype: DType, size: usize) -> Job<'a> {
     Job::new(dtype, [size / 2; 3], move |src, at, out, cx| {
         let out = GradientOut { magnitude: Some(out.view_mut(BOX)), vector: None };
         gradient(src, size, GradientWeight::Distance, [1.0; 3], Affine::IDENTITY, None, at, out, cx);
+    })
+}
+
+fn rank_job<'a>(dtype: DType, window: WindowShape, radius: usize) -> Job<'a> {
+    let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
+    Job::new(dtype, [radius; 3], move |src, at, out, cx| {
+        rank(src, &params, window, Ties::Le, at, out.view_mut(BOX), cx);
     })
 }
