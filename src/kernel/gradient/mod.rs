@@ -84,8 +84,8 @@ pub fn scratch_bytes(_dtype: DType, _src: Shape, _dst: Shape, _size: usize) -> u
 /// Output voxels of a row that are worked on together: their sums stay in the L1 cache.
 const RUN: usize = 128;
 
-/// Row sums at most: 9 symmetric, 6 antisymmetric along y, 6 along z.
-const SUMS: usize = 21;
+/// Weighted columns: 2 for component x, 3 each for y and z.
+const SUMS: usize = 8;
 
 /// What to do everywhere: `H` is the window's half-width, `S` what row sums are kept in.
 struct Job<'a, const H: usize, S> {
@@ -186,17 +186,30 @@ fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
     out: &mut GradientOut,
     scratch: &mut [u8],
 ) {
-    let (sums, rest) = cut::<S>(scratch, SUMS * STRIDE);
+    let (sums, rest) = cut::<f64>(scratch, SUMS * STRIDE);
     let (parts, _) = cut::<f64>(rest, 3 * RUN);
     let gaps = T::DTYPE.is_float() || missing.is_some();
     for z in 0..job.shape[0] {
         for y in 0..job.shape[1] {
             for x in (0..job.shape[2]).step_by(RUN) {
                 let n = RUN.min(job.shape[2] - x);
+                let m = n + 2 * H;
                 let centre = [job.at[0] + z, job.at[1] + y, job.at[2] + x];
-                sum_rows::<H, T, S>(&src, missing, centre, n, sums);
-                weigh_rows::<H, T, S>(job.table, sums, n, parts);
-                if gaps {
+                let rows: [[&[T]; 5]; 5] = std::array::from_fn(|dz| {
+                    std::array::from_fn(|dy| {
+                        let (dz, dy) = (dz.min(2 * H), dy.min(2 * H));
+                        &src.row_at(centre[0] + dz - H, centre[1] + dy - H)[centre[2] - H..][..m]
+                    })
+                });
+                let full = m / LANES * LANES;
+                for i in (0..full).step_by(LANES) {
+                    weigh_columns::<H, T, S, true>(&rows, missing, job.table, i, sums);
+                }
+                if full < m {
+                    weigh_columns::<H, T, S, false>(&rows, missing, job.table, full, sums);
+                }
+                join_columns::<H>(sums, parts);
+                if gaps && any_nan(&rows[H][H][H..H + n], missing, n, parts) {
                     regress_gaps(&src, missing, centre, n, job.table, parts);
                 }
                 store([z, y, x], n, job.slope, parts, out);
@@ -208,109 +221,111 @@ fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
 /// Elements from one row of sums to the next.
 const STRIDE: usize = RUN + 8;
 
-/// Where the sums stand: symmetric in y and z by (|dz|, |dy|); antisymmetric along y by (|dz|, dy); along z by (|dy|, dz).
-const fn symmetric(dz: usize, dy: usize) -> usize {
-    dz * 3 + dy
-}
-const fn along_y(dz: usize, dy: usize) -> usize {
-    9 + dz * 2 + dy - 1
-}
-const fn along_z(dy: usize, dz: usize) -> usize {
-    15 + dy * 2 + dz - 1
-}
+/// Columns worked on at once: their eight sums stay in registers.
+const LANES: usize = 8;
 
-/// Sums and differences of the rows that mirror each other about the centre's row, from x - H to x + n + H.
+/// Weighted sums over y and z of [`LANES`] columns from `i` on: for component x one row per |dx| = 1, 2, for y and z one
+/// per |dx| = 0, 1, 2. Without `FULL` the rows may end inside the lanes.
 #[inline(always)]
-fn sum_rows<const H: usize, T: Voxel, S: Sum<T>>(
-    src: &View<T>,
+fn weigh_columns<const H: usize, T: Voxel, S: Sum<T>, const FULL: bool>(
+    rows: &[[&[T]; 5]; 5],
     missing: Option<T>,
-    [z, y, x]: [usize; 3],
-    n: usize,
-    sums: &mut [S],
+    table: &Table,
+    i: usize,
+    sums: &mut [f64],
 ) {
-    let m = n + 2 * H;
-    let row = |dz: isize, dy: isize| &src.row_at(z.wrapping_add_signed(dz), y.wrapping_add_signed(dy))[x - H..][..m];
-    let of = |v: &T| S::of(*v, missing);
-    sums[..m].iter_mut().zip(row(0, 0)).for_each(|(s, v)| *s = of(v));
+    let row = |dz: usize, dy: usize| -> [S; LANES] {
+        let row = rows[dz][dy];
+        if FULL {
+            let row: &[T; LANES] = row[i..i + LANES].try_into().unwrap();
+            row.map(|v| S::of(v, missing))
+        } else {
+            std::array::from_fn(|l| S::of(row[(i + l).min(row.len() - 1)], missing))
+        }
+    };
+    let mut acc = [[0.0f64; LANES]; SUMS];
+    let mut add = |index: usize, w: f64, sum: &[S; LANES]| {
+        for l in 0..LANES {
+            acc[index][l] += w * sum[l].to_f64();
+        }
+    };
+    let [in_z, in_y, in_x] = &table.along;
+    let c = row(H, H);
+    for dx in 1..=H {
+        add(dx - 1, in_x[0][0][dx], &c);
+    }
     for d in 1..=H {
-        let (high, low) = (row(0, d as isize), row(0, -(d as isize)));
-        let [sym, anti] = sums.get_disjoint_mut([at(symmetric(0, d), m), at(along_y(0, d), m)]).unwrap();
-        for i in 0..m {
-            let (a, b) = (of(&high[i]), of(&low[i]));
-            sym[i] = a.plus(b);
-            anti[i] = a.minus(b);
-        }
-        let (high, low) = (row(d as isize, 0), row(-(d as isize), 0));
-        let [sym, anti] = sums.get_disjoint_mut([at(symmetric(d, 0), m), at(along_z(0, d), m)]).unwrap();
-        for i in 0..m {
-            let (a, b) = (of(&high[i]), of(&low[i]));
-            sym[i] = a.plus(b);
-            anti[i] = a.minus(b);
+        let (a, b) = (row(H, H + d), row(H, H - d));
+        let (even, odd) = (plus(&a, &b), minus(&a, &b));
+        (1..=H).for_each(|dx| add(dx - 1, in_x[0][d][dx], &even));
+        (0..=H).for_each(|dx| add(2 + dx, in_y[0][d][dx], &odd));
+        let (a, b) = (row(H + d, H), row(H - d, H));
+        let (even, odd) = (plus(&a, &b), minus(&a, &b));
+        (1..=H).for_each(|dx| add(dx - 1, in_x[d][0][dx], &even));
+        (0..=H).for_each(|dx| add(5 + dx, in_z[d][0][dx], &odd));
+    }
+    for dz in 1..=H {
+        for dy in 1..=H {
+            let (pp, pm, mp, mm) = (row(H + dz, H + dy), row(H + dz, H - dy), row(H - dz, H + dy), row(H - dz, H - dy));
+            let even = plus(&plus(&pp, &pm), &plus(&mp, &mm));
+            let odd_y = plus(&minus(&pp, &pm), &minus(&mp, &mm));
+            let odd_z = plus(&minus(&pp, &mp), &minus(&pm, &mm));
+            (1..=H).for_each(|dx| add(dx - 1, in_x[dz][dy][dx], &even));
+            (0..=H).for_each(|dx| add(2 + dx, in_y[dz][dy][dx], &odd_y));
+            (0..=H).for_each(|dx| add(5 + dx, in_z[dz][dy][dx], &odd_z));
         }
     }
-    for (dz, dy) in (1..=H).flat_map(|dz| (1..=H).map(move |dy| (dz, dy))) {
-        let (iz, iy) = (dz as isize, dy as isize);
-        let (pp, pm, mp, mm) = (row(iz, iy), row(iz, -iy), row(-iz, iy), row(-iz, -iy));
-        let places = [at(symmetric(dz, dy), m), at(along_y(dz, dy), m), at(along_z(dy, dz), m)];
-        let [sym, in_y, in_z] = sums.get_disjoint_mut(places).unwrap();
-        for i in 0..m {
-            let (pp, pm, mp, mm) = (of(&pp[i]), of(&pm[i]), of(&mp[i]), of(&mm[i]));
-            sym[i] = pp.plus(pm).plus(mp.plus(mm));
-            in_y[i] = pp.minus(pm).plus(mp.minus(mm));
-            in_z[i] = pp.minus(mp).plus(pm.minus(mm));
-        }
+    for (index, acc) in acc.iter().enumerate() {
+        sums[index * STRIDE + i..][..LANES].copy_from_slice(acc);
     }
 }
 
-/// Row of sums `index`, its first `n` elements.
-const fn at(index: usize, n: usize) -> std::ops::Range<usize> {
-    index * STRIDE..index * STRIDE + n
-}
-
-/// Output voxels whose sums stay in registers.
-const LANES: usize = 16;
-
-/// The three components (z, y, x in turn, [`RUN`] apart) of `n` voxels from their row sums. The last lanes may hold rubbish.
 #[inline(always)]
-fn weigh_rows<const H: usize, T: Voxel, S: Sum<T>>(table: &Table, sums: &[S], n: usize, parts: &mut [f64]) {
-    for i in (0..n).step_by(LANES) {
-        let lanes = |index: usize, shift: isize| -> &[S; LANES] {
-            let start = (index * STRIDE + i + H).wrapping_add_signed(shift);
-            sums[start..start + LANES].try_into().unwrap()
-        };
-        let mut g = [[0.0; LANES]; 3];
-        for dz in 0..=H {
-            for dy in 0..=H {
-                for dx in 1..=H {
-                    let w = table.along[2][dz][dy][dx];
-                    let (a, b) = (lanes(symmetric(dz, dy), dx as isize), lanes(symmetric(dz, dy), -(dx as isize)));
-                    for l in 0..LANES {
-                        g[2][l] += w * a[l].minus(b[l]).to_f64();
-                    }
-                }
-            }
-        }
-        for (far, near) in (0..=H).flat_map(|near| (1..=H).map(move |far| (far, near))) {
-            for (axis, index, w) in [
-                (0, along_z(near, far), &table.along[0][far][near]),
-                (1, along_y(near, far), &table.along[1][near][far]),
-            ] {
-                let middle = lanes(index, 0);
-                for l in 0..LANES {
-                    g[axis][l] += w[0] * middle[l].to_f64();
-                }
-                for dx in 1..=H {
-                    let (a, b) = (lanes(index, dx as isize), lanes(index, -(dx as isize)));
-                    for l in 0..LANES {
-                        g[axis][l] += w[dx] * a[l].plus(b[l]).to_f64();
-                    }
-                }
-            }
-        }
-        for (axis, g) in g.iter().enumerate() {
-            parts[axis * RUN + i..][..LANES].copy_from_slice(g);
+fn plus<T, S: Sum<T>>(a: &[S; LANES], b: &[S; LANES]) -> [S; LANES] {
+    std::array::from_fn(|l| a[l].plus(b[l]))
+}
+
+#[inline(always)]
+fn minus<T, S: Sum<T>>(a: &[S; LANES], b: &[S; LANES]) -> [S; LANES] {
+    std::array::from_fn(|l| a[l].minus(b[l]))
+}
+
+/// The three components (z, y, x in turn, [`RUN`] apart) from the weighted columns; past the run's end they are rubbish.
+#[inline(always)]
+fn join_columns<const H: usize>(sums: &[f64], parts: &mut [f64]) {
+    let column =
+        |index: usize, from: usize| -> &[f64; RUN] { sums[index * STRIDE + from..][..RUN].try_into().unwrap() };
+    let (parts_zy, gx) = parts.split_at_mut(2 * RUN);
+    let (a, b) = (column(0, H + 1), column(0, H - 1));
+    (0..RUN).for_each(|i| gx[i] = a[i] - b[i]);
+    if H == 2 {
+        let (a, b) = (column(1, 4), column(1, 0));
+        (0..RUN).for_each(|i| gx[i] += a[i] - b[i]);
+    }
+    for (g, first) in parts_zy.chunks_exact_mut(RUN).zip([5, 2]) {
+        let (c, a, b) = (column(first, H), column(first + 1, H + 1), column(first + 1, H - 1));
+        (0..RUN).for_each(|i| g[i] = c[i] + (a[i] + b[i]));
+        if H == 2 {
+            let (a, b) = (column(first + 2, 4), column(first + 2, 0));
+            (0..RUN).for_each(|i| g[i] += a[i] + b[i]);
         }
     }
+}
+
+/// Whether a centre is missing or a component NaN.
+#[inline(always)]
+fn any_nan<T: Voxel>(centres: &[T], missing: Option<T>, n: usize, parts: &[f64]) -> bool {
+    let mut any = false;
+    for v in centres {
+        let v = <f64 as Sum<T>>::of(*v, missing);
+        any |= v.is_nan();
+    }
+    for g in parts.chunks_exact(RUN) {
+        for g in &g[..n] {
+            any |= g.is_nan();
+        }
+    }
+    any
 }
 
 /// Puts the full regression where a voxel of the window is missing. A missing voxel makes a component NaN, since each but
