@@ -198,7 +198,7 @@ fn map_output(config: &Config, infos: &[VolumeInfo], lowered: &Lowered, index: u
         format: output.format,
         dtype,
         fill: if dtype.is_float() { f64::NAN } else { 0.0 },
-        pyramid: chain.skip(first),
+        pyramid: chain.clone().skip(first),
         components: (names.len() > 1).then_some(names.len()),
         component_names: names,
         chunk: output.chunk,

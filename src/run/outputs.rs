@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::assemble::Target;
 use super::journal;
-use crate::config::{Config, Output};
+use crate::config::{Config, Output, provenance};
 use crate::grid::Region;
 use crate::kernel::reduce::planes;
 use crate::plan::{Group, OutputPlan, Plan};
@@ -185,7 +185,7 @@ pub fn attributes(
     json!({
         "complete": true,
         "version": env!("CARGO_PKG_VERSION"),
-        "config": config.text,
+        "config": provenance(&config.text),
         "config_hash": hash,
         "input": inputs,
         "from": from,

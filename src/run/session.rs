@@ -103,7 +103,11 @@ impl<'a> Session<'a> {
             }
             Start::Afresh => false,
             Start::Resume { done, globals } => {
-                done.into_iter().filter(|&t| t < self.done.len()).for_each(|t| self.done[t] = true);
+                for task in done {
+                    if let Some(flag) = self.done.get_mut(task) {
+                        *flag = true;
+                    }
+                }
                 self.globals = globals;
                 true
             }
@@ -342,7 +346,7 @@ impl<'a> Session<'a> {
         let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
         let due = now >= last + 100 || bricks == total;
         if due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok() {
-            self.pool.trim(brick.bytes * brick.in_flight as u64 / 2);
+            self.pool.trim((brick.bytes * brick.in_flight as u64 / 2) as usize);
             for source in &self.sources {
                 source.release(Region::whole(source.info().shape));
             }
