@@ -74,15 +74,23 @@ impl Reblock {
         if decoder.dimensions().ok() != Some((width as u32, self.height as u32)) {
             return Err(broken(path, image, "its size changed since it was opened"));
         }
+        let have = super::bytes::file_len(path)?;
         let (cw, ch) = decoder.chunk_dimensions();
         let (cw, ch) = ((cw as usize).min(width).max(1), (ch as usize).clamp(1, self.height));
-        let bytes = width.checked_mul(ch).and_then(|n| n.checked_mul(size)).filter(|n| *n <= MOST_CHUNK);
-        let bytes = bytes
-            .ok_or_else(|| broken(path, image, format!("its strips or tiles are larger than {MOST_CHUNK} bytes")))?;
         let across = match decoder.get_chunk_type() {
             tiff::decoder::ChunkType::Strip => 1,
             tiff::decoder::ChunkType::Tile => width.div_ceil(decoder.chunk_dimensions().0.max(1) as usize),
         };
+        // No codec here expands 4096-fold: a size that would need it is a lie, not worth allocating.
+        let most = MOST_CHUNK.min((have as usize).saturating_mul(4096));
+        let bytes =
+            width.checked_mul(ch).and_then(|n| n.checked_mul(size)).filter(|n| *n <= most).ok_or_else(|| {
+                broken(
+                    path,
+                    image,
+                    format!("a row of its strips or tiles is more than the {most} bytes that are believed"),
+                )
+            })?;
         for (b, y) in (0..self.height).step_by(ch).enumerate() {
             let rows = ch.min(self.height - y);
             for i in 0..across {

@@ -32,7 +32,6 @@ pub struct ArrayMeta {
     /// Names of the codecs that turn bytes to bytes in an inner chunk, the first applied first when written.
     pub byte_codecs: Vec<String>,
     pub names: Vec<Option<String>>,
-    pub attributes: Value,
     /// The metadata file's text.
     pub text: Vec<u8>,
 }
@@ -125,7 +124,6 @@ fn array_v3(path: &Path, value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
         inner: outer.clone(),
         shard: None,
         byte_codecs: names(list),
-        attributes: value["attributes"].clone(),
         shape,
         dtype,
         outer,
@@ -175,7 +173,6 @@ fn array_v2(path: &Path, value: Value, attributes: Value, text: Vec<u8>) -> Resu
         inner: outer.clone(),
         shard: None,
         byte_codecs: value["compressor"]["id"].as_str().map(str::to_string).into_iter().collect(),
-        attributes,
         shape,
         dtype,
         outer,
