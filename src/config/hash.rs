@@ -7,7 +7,7 @@ use super::{Config, InputKind};
 /// Hex of a BLAKE3 hash over inputs' selection and overrides, the stages that outputs need, outputs and region.
 ///
 /// Left out: memory, threads, brick, scratch, device (placement is kept by the journal), report paths, unused stages, lines
-/// and comments, folders of outputs, and paths of inputs (the input's identity says more than its name). Numbers enter with
+/// and comments, paths of outputs, and paths of inputs (the input's identity says more than its name). Numbers enter with
 /// all their digits. The order of tables does not matter, that of lists does.
 pub fn config_hash(config: &Config) -> String {
     let mut parts: Vec<String> = Vec::new();
@@ -29,9 +29,8 @@ pub fn config_hash(config: &Config) -> String {
     }
     for o in &config.outputs {
         parts.push(format!(
-            "output {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?}",
+            "output {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?}",
             o.name,
-            o.path.file_name(),
             o.format,
             o.from,
             o.dtype,

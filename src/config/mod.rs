@@ -10,6 +10,7 @@ pub mod keys;
 pub mod kinds;
 pub mod model;
 pub mod outputs;
+pub mod provenance;
 pub mod read;
 pub mod schema;
 pub mod section;
@@ -23,6 +24,7 @@ use std::path::{Path, PathBuf};
 pub use hash::config_hash;
 pub use keys::op_channels;
 pub use model::*;
+pub use provenance::provenance;
 pub use schema::schema;
 
 use crate::{Error, Result};

@@ -3,6 +3,7 @@
 //! Axes are `[z, y, x]` everywhere, x contiguous. Boxes are half-open. Voxel centres lie at integer indices.
 
 pub mod affine;
+pub mod any;
 pub mod border;
 pub mod dtype;
 pub mod order;

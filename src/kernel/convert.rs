@@ -1,18 +1,239 @@
 //! Arrays between stages to output types.
 
-use crate::grid::{AnyView, AnyViewMut};
+use super::simd::Level;
+use crate::grid::{AnyView, AnyViewMut, DType, Voxel};
+use crate::with_view;
 
 /// How a channel's values become an output type.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mapping {
-    /// Values `lo` and `hi` map to 0 and the integer type's maximum (round half even, saturating); `None` keeps values.
+    /// Integer outputs: values `lo` and `hi` map to 0 and the type's maximum (computed in f64, round half even,
+    /// saturating between the two); `None` keeps values (round half even, saturating to the type). Float outputs always
+    /// keep values.
     pub range: Option<[f64; 2]>,
-    /// Integer outputs: what NaN becomes.
+    /// Integer outputs: the stored code that NaN becomes.
     pub fill: f64,
 }
 
-/// Converts voxel by voxel. Panics if the shapes differ.
+impl Mapping {
+    /// Values as they are.
+    pub const KEEP: Mapping = Mapping { range: None, fill: 0.0 };
+}
+
+/// Converts voxel by voxel on the best instruction set of this CPU. Panics if the shapes differ.
 pub fn convert(src: AnyView, mapping: Mapping, dst: AnyViewMut) {
-    let _ = (src, mapping, dst);
-    todo!()
+    convert_at(Level::detect(), src, mapping, dst)
+}
+
+/// Converts voxel by voxel. Panics if the shapes differ.
+pub fn convert_at(level: Level, src: AnyView, mapping: Mapping, mut dst: AnyViewMut) {
+    assert_eq!(src.shape(), dst.shape(), "conversion keeps the shape");
+    let [nz, ny, _] = src.shape();
+    with_view!(AnyView, src, s => with_view!(AnyViewMut, &mut dst, d => {
+        for z in 0..nz {
+            for y in 0..ny {
+                convert_row(level, s.row_at(z, y), mapping, d.row_at(z, y));
+            }
+        }
+    }))
+}
+
+/// Converts one row. Panics if the lengths differ.
+pub fn convert_row<S: Voxel, D: Output>(level: Level, src: &[S], mapping: Mapping, dst: &mut [D]) {
+    assert_eq!(src.len(), dst.len());
+    if D::DTYPE.is_float() || (S::DTYPE == D::DTYPE && mapping.range.is_none()) {
+        cast(level, src, dst)
+    } else {
+        quantise(level, src, Linear::new(mapping, D::DTYPE), D::from_f64(mapping.fill), dst)
+    }
+}
+
+/// `code = clamp((v * half - lo) * scale, low, high)` before rounding.
+#[derive(Debug, Clone, Copy)]
+struct Linear {
+    /// 0.5 where `hi - lo` would overflow, else 1.
+    half: f64,
+    lo: f64,
+    scale: f64,
+    low: f64,
+    high: f64,
+}
+
+impl Linear {
+    fn new(mapping: Mapping, dtype: DType) -> Linear {
+        let (least, high) = dtype.range();
+        match mapping.range {
+            None => Linear { half: 1.0, lo: 0.0, scale: 1.0, low: least, high },
+            Some([lo, hi]) => {
+                let half = if (hi - lo).is_finite() { 1.0 } else { 0.5 };
+                Linear { half, lo: lo * half, scale: high / (hi * half - lo * half), low: 0.0, high }
+            }
+        }
+    }
+}
+
+/// A type that can be stored; integers are cut out of the low bits of a rounded f64.
+pub trait Output: Voxel {
+    /// The low bits as this type (integers; floats reinterpret nothing and are never asked).
+    fn from_low_bits(bits: u64) -> Self;
+    /// The value rounded to this type (floats).
+    fn cast_from(v: f64) -> Self;
+}
+
+macro_rules! output {
+    ($($t:ty)*) => {$(
+        impl Output for $t {
+            #[inline(always)]
+            fn from_low_bits(bits: u64) -> Self { bits as $t }
+            #[inline(always)]
+            fn cast_from(v: f64) -> Self { v as $t }
+        }
+    )*};
+}
+output!(u8 i8 u16 i16 u32 i32 f32 f64);
+
+/// 1.5 * 2^52: adding it rounds a number below 2^51 to an integer, ties to even, and leaves it in the low bits.
+const ROUNDER: f64 = 6755399441055744.0;
+
+#[inline(always)]
+fn quantise_inner<S: Voxel, D: Output>(src: &[S], map: Linear, fill: D, dst: &mut [D]) {
+    let Linear { half, lo, scale, low, high } = map;
+    for (d, s) in dst.iter_mut().zip(src) {
+        let v = s.to_f64();
+        let t = (v * half - lo) * scale;
+        // Written as compares, not `clamp`, so that they become one instruction each; NaN becomes `low`.
+        let t = if t > low { t } else { low };
+        let t = if t < high { t } else { high };
+        let code = D::from_low_bits((t + ROUNDER).to_bits());
+        *d = if v.is_nan() { fill } else { code };
+    }
+}
+
+#[inline(always)]
+fn cast_inner<S: Voxel, D: Output>(src: &[S], dst: &mut [D]) {
+    for (d, s) in dst.iter_mut().zip(src) {
+        *d = D::cast_from(s.to_f64());
+    }
+}
+
+crate::multiversion! {
+    fn quantise[S: Voxel, D: Output](src: &[S], map: Linear, fill: D, dst: &mut [D]) -> () = quantise_inner;
+}
+crate::multiversion! {
+    fn cast[S: Voxel, D: Output](src: &[S], dst: &mut [D]) -> () = cast_inner;
+}
+
+/// One value by the words of [`Mapping`], for checking [`convert`].
+#[cfg(test)]
+fn reference<D: Voxel>(v: f64, mapping: Mapping) -> D {
+    if D::DTYPE.is_float() {
+        return D::from_f64(v);
+    }
+    if v.is_nan() {
+        return D::from_f64(mapping.fill);
+    }
+    match mapping.range {
+        None => D::from_f64(v),
+        Some([lo, hi]) => {
+            let max = D::DTYPE.range().1;
+            D::from_f64(((v - lo) * (max / (hi - lo))).clamp(0.0, max))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::brick::Voxels;
+    use crate::grid::{View, ViewMut};
+
+    fn hostile(dtype: DType, n: usize) -> Voxels {
+        let (lo, hi) = dtype.range();
+        let mut values =
+            vec![0.0, -0.0, 1.0, 0.5, 1.5, 2.5, -0.5, 254.5, 255.0, 65534.5, lo, hi, 1e-300, 0.1, 127.0, -1.0];
+        if dtype.is_float() {
+            values.extend([f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e30, -1e30, 4294967295.5, 2147483646.5]);
+        }
+        let mut state = 1u64;
+        let mut v = Voxels::zeroed(dtype, n);
+        crate::with_voxels!(&mut v, v => for (i, d) in v.iter_mut().enumerate() {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            let random = (state >> 40) as f64 / 256.0 - 1000.0;
+            *d = Voxel::from_f64(if i < values.len() { values[i] } else { random });
+        });
+        v
+    }
+
+    #[test]
+    fn every_pair_of_types_equals_the_reference_at_every_level() {
+        let shape = [3, 5, 37];
+        let n = shape.iter().product();
+        let mappings = [
+            Mapping { range: None, fill: 7.0 },
+            Mapping { range: Some([0.0, 1.0]), fill: 0.0 },
+            Mapping { range: Some([-3.25, 1000.5]), fill: 255.0 },
+        ];
+        for from in DType::ALL {
+            let src = hostile(from, n);
+            for to in DType::ALL {
+                for mapping in mappings {
+                    for level in Level::available() {
+                        let mut dst = Voxels::zeroed(to, n);
+                        convert_at(level, src.view(shape), mapping, dst.view_mut(shape));
+                        let mut want = Voxels::zeroed(to, n);
+                        crate::with_voxels!(&mut want, w => for (i, w) in w.iter_mut().enumerate() {
+                            *w = reference(src.at(i), mapping);
+                        });
+                        assert_eq!(dst.as_bytes(), want.as_bytes(), "{from} -> {to}, {mapping:?}, {level:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn openness_rounds_half_to_even_of_the_exact_product() {
+        // Around every half code of u16: O * 65535 is exact in f64 for f32 openness.
+        let mut values = Vec::new();
+        for code in 0..65535u32 {
+            let half = ((code as f64 + 0.5) / 65535.0) as f32;
+            values.extend([half, f32::from_bits(half.to_bits() + 1), f32::from_bits(half.to_bits() - 1)]);
+        }
+        values.extend([0.5, 1.0, 0.0]);
+        let mut codes = vec![0u16; values.len()];
+        let shape = [1, 1, values.len()];
+        let unit = Mapping { range: Some([0.0, 1.0]), fill: 0.0 };
+        convert(AnyView::F32(View::dense(&values, shape)), unit, AnyViewMut::U16(ViewMut::dense(&mut codes, shape)));
+        for (v, c) in values.iter().zip(&codes) {
+            assert_eq!(*c as f64, (*v as f64 * 65535.0).round_ties_even(), "{v}");
+        }
+        let mut ties = [0u8; 2];
+        let half = [0.5f32 / 255.0 * 255.0, 0.5];
+        let shape = [1, 1, 2];
+        convert(AnyView::F32(View::dense(&half, shape)), unit, AnyViewMut::U8(ViewMut::dense(&mut ties, shape)));
+        assert_eq!(ties, [128, 128], "127.5 rounds to the even 128");
+    }
+
+    #[test]
+    fn a_range_wider_than_f64_still_maps_its_middle_to_the_middle() {
+        let mapping = Mapping { range: Some([-1.7e308, 1.7e308]), fill: 0.0 };
+        let mut codes = [9u8; 4];
+        let values = [-1.7e308, 0.0, 1.7e308, f64::NEG_INFINITY];
+        convert_row(Level::Baseline, &values, mapping, &mut codes);
+        assert_eq!(codes, [0, 128, 255, 0]);
+    }
+
+    #[test]
+    fn strided_views_convert_only_their_rows() {
+        let src: Vec<f32> = (0..60).map(|i| i as f32).collect();
+        let mut dst = vec![200u8; 60];
+        let (shape, plane, row) = ([2, 2, 3], 30, 5);
+        convert(
+            AnyView::F32(View::strided(&src, shape, plane, row)),
+            Mapping::KEEP,
+            AnyViewMut::U8(ViewMut::strided(&mut dst, shape, plane, row)),
+        );
+        let inside = |i: usize| i % 30 < 10 && i % 5 < 3;
+        assert!((0..60).all(|i| dst[i] == if inside(i) { i as u8 } else { 200 }));
+    }
 }

@@ -8,6 +8,8 @@
 pub mod convert;
 pub mod gaussian;
 pub mod gradient;
+#[cfg(test)]
+pub(crate) mod hostile;
 pub mod mask;
 pub mod obscurance;
 pub mod occlusion_map;
@@ -16,6 +18,7 @@ pub mod rank;
 pub mod reduce;
 pub mod simd;
 pub mod ssim;
+pub(crate) mod values;
 pub mod window;
 
 /// What every kernel is given besides its voxels.

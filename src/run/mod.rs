@@ -1,18 +1,42 @@
-//! Executes a plan.
+//! Executes a plan: a stream of bricks per group, tasks marked as they finish, a second phase for the coarse levels, then
+//! the attributes that say `complete`.
 
+pub mod assemble;
+pub mod budget;
+pub mod cache;
 pub mod cancel;
+pub mod compute;
+pub mod journal;
+pub mod maps;
+pub mod metrics;
 pub mod options;
+pub mod outputs;
+pub mod prepass;
+pub mod program;
+pub mod read;
 pub mod report;
+pub mod second;
+pub mod session;
+pub mod steps;
+pub mod stream;
+pub mod trace;
+pub mod value;
 
 pub use cancel::Cancel;
 pub use options::{Progress, RunOptions, Silent};
 pub use report::Report;
+pub use session::Session;
 
 use crate::Result;
 use crate::config::Config;
 
-/// Runs the job.
+/// Runs the whole job: plans, opens, streams every task that is not done, finishes.
+///
+/// # Errors
+/// Wrong configs, unreadable inputs, full disks; whatever was finished stays, and `resume` continues it.
 pub fn run(config: &Config, options: &RunOptions, progress: &dyn Progress) -> Result<Report> {
-    let _ = (config, options, progress);
-    todo!()
+    let session = Session::open(config, options, progress)?;
+    let tasks = session.open_tasks();
+    session.run_tasks(&tasks)?;
+    session.finish()
 }

@@ -2,10 +2,14 @@
 
 pub mod info;
 pub mod layout;
+pub mod open;
 pub mod sink;
 pub mod source;
+pub mod spill;
 
 pub use info::VolumeInfo;
 pub use layout::{LevelLayout, Pyramid};
+pub use open::open_inputs;
 pub use sink::{Sink, SinkSpec};
 pub use source::Source;
+pub use spill::Spill;

@@ -1,8 +1,34 @@
-//! Obscurance sweeps along parallel lattice lines (paper B).
+//! Obscurance sweeps along parallel lattice lines (paper B; SPEC section 4).
+//!
+//! | file | holds |
+//! |---|---|
+//! | `lines` | directions to families of lines, distances, fixed-point contributions |
+//! | `keys` | voxels to padded, order-preserving unsigned keys |
+//! | `driver` | tiles, sheets, senses |
+//! | `scan` | next greater key on 64 lines |
+//! | `sinks` | what is summed |
+//! | `reference` | all of it by the definition |
+
+mod driver;
+mod keys;
+mod lines;
+#[cfg(test)]
+mod reference;
+mod scan;
+mod sinks;
+#[cfg(test)]
+mod tests;
 
 use super::Context;
-use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View};
+use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
+use crate::kernel::simd::Level;
 use crate::stage::{DirectionSet, DirectionWeights, Rho};
+use crate::with_view;
+use driver::{Buffers, FRAMES, in_frame};
+use keys::{Coded, Key, LANES, Plain, Volume};
+use sinks::{OpenSum, Sink, WeightedSum};
+
+pub use lines::{is_valid_count, rho};
 
 /// Parameters with units resolved.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,46 +45,261 @@ pub struct ObscuranceParams {
     pub flipped: bool,
     /// Stored value of integer types that marks a missing voxel; floats use NaN.
     pub missing: Option<i64>,
+    /// Linear r, g, b seen where nothing occludes.
     pub ambient: [f64; 3],
 }
 
 /// Directions, lines and tables made once from the parameters.
 #[derive(Debug, Clone)]
-pub struct Prepared;
+pub struct Prepared {
+    params: ObscuranceParams,
+    families: Vec<lines::Family>,
+    /// Sum of contributions where nothing occludes.
+    total: u64,
+}
 
 /// What a sweep reads besides densities, and writes.
 pub struct ObscuranceIo<'a> {
-    /// Colour of each voxel of `src` (linear r, g, b), for colour bleeding.
+    /// Colour of each voxel of `src` (linear r, g, b), for colour bleeding. NaN counts as 0, and everything is cut off
+    /// at +-2^18.
     pub colour: Option<[View<'a, f32>; 3]>,
-    /// Components along z, y, x of the gradient on the *output* box, for `weight_by_normal`.
+    /// Components along z, y, x of the physical gradient of the *stored* values on the *output* box, for
+    /// `weight_by_normal`: directions weigh max(0, n.w), n pointing toward the open side. Uniform where it is zero or not
+    /// finite. Where no direction of the set has a positive weight, the voxel is open.
     pub normal: Option<[View<'a, f32>; 3]>,
     /// f32, the output box.
     pub openness: Option<AnyViewMut<'a>>,
-    /// f32, the output box.
+    /// f32, the output box. Asks for `colour`.
     pub rgb: Option<[AnyViewMut<'a>; 3]>,
 }
 
+/// Output voxels whose sums are kept at once, `[z, y, x]`: they stay in the third-level cache while all families pass.
+const TILE: Shape = [128, 128, 256];
+
 impl Prepared {
+    /// Panics on a spacing or distance that is not positive.
     pub fn new(params: &ObscuranceParams) -> Prepared {
-        let _ = params;
-        todo!()
+        assert!(params.spacing.iter().all(|s| *s > 0.0 && s.is_finite()), "spacing {:?}", params.spacing);
+        assert!(params.max_distance >= 0.0, "max_distance {}", params.max_distance);
+        let (families, total) = lines::families(params);
+        Prepared { params: params.clone(), families, total }
     }
 
     /// Halo in voxels per axis.
     pub fn reach(&self) -> [usize; 3] {
-        todo!()
+        self.families.iter().map(|f| f.halo()).fold([0; 3], |m, h| std::array::from_fn(|a| m[a].max(h[a])))
     }
 
     /// Sweeps every direction. `src` covers `src_box`: `dst_box` grown by [`Self::reach`] and clipped to the volume, in
-    /// *global* indices (lines are tiled by them).
+    /// *global* indices (lines are tiled by them). Beyond `src` everything is open. A missing voxel outputs NaN.
+    ///
+    /// Within 1e-6 of the formula; the bits do not depend on the boxes, nor on the level of the CPU.
+    /// Panics if an extent does not fit its box, an output is not f32, or `rgb` comes without `colour`.
     pub fn sweep(&self, src: AnyView, src_box: Region, dst_box: Region, io: ObscuranceIo, cx: &mut Context) {
-        let _ = (src, src_box, dst_box, io, cx);
-        todo!()
+        assert_eq!(src.shape(), src_box.shape(), "src must cover its box");
+        assert!(src_box.contains(&dst_box), "{src_box:?} must contain {dst_box:?}");
+        if dst_box.is_empty() {
+            return;
+        }
+        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx));
     }
 
     /// Bytes of scratch that [`Self::sweep`] takes at most.
     pub fn scratch_bytes(&self, dtype: DType, src: Shape, dst: Shape, colour: bool, normal: bool) -> usize {
-        let _ = (dtype, src, dst, colour, normal);
-        todo!()
+        let key = dtype.size();
+        self.sizes(src, dst).bytes(key, colour, normal)
     }
+
+    fn sizes(&self, src: Shape, dst: Shape) -> Sizes {
+        let tile: Shape = std::array::from_fn(|a| TILE[a].min(dst[a]));
+        let planes = |f: &lines::Family| (tile[f.axis] + 2 * driver::reach_in(f, src[f.axis])).min(src[f.axis]);
+        let turned = self.families.iter().any(|f| f.axis == 2);
+        Sizes {
+            keys: [keys::padded_len(src), if turned { keys::padded_len(FRAMES[1].map(|a| src[a])) } else { 0 }],
+            tile: tile.iter().product(),
+            sheet: self.families.iter().map(planes).max().unwrap_or(0),
+            queries: tile.into_iter().max().unwrap_or(0),
+            extent: src.into_iter().max().unwrap_or(0),
+        }
+    }
+
+    fn sweep_typed<T: Coded>(
+        &self,
+        src: View<T>,
+        src_box: Region,
+        dst_box: Region,
+        io: ObscuranceIo,
+        cx: &mut Context,
+    ) {
+        let sizes = self.sizes(src_box.shape(), dst_box.shape());
+        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()));
+        let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
+        let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
+        let (sheet, bytes) = carve::<T::Key>(bytes, sizes.sheet * LANES);
+        let (hits, bytes) = carve_all::<u32, 2>(bytes, sizes.queries * LANES);
+        let (stack, bytes) = carve::<u32>(bytes, sizes.sheet);
+        let (shifts, bytes) = carve_all::<i32, 2>(bytes, sizes.extent);
+        let (tables, bytes) = carve_all::<u32, 2>(bytes, sizes.extent + 1);
+
+        let (least, most) = keys::encode(src, self.params.missing, self.params.flipped, natural);
+        let flat = least >= most; // nothing is greater than anything
+        if !flat && !swapped.is_empty() {
+            keys::swap(natural, src_box.shape(), swapped);
+        }
+        let mut pass = Pass {
+            prepared: self,
+            level: cx.level,
+            flat,
+            volumes: [natural, swapped],
+            src_box,
+            dst_box,
+            buffers: Buffers { sheet, hits, stack, shifts, tables },
+        };
+        let missing = keys::missing_of::<T>(self.params.missing);
+        let gone =
+            |p: [i64; 3]| keys::is_missing(src.at(std::array::from_fn(|a| (p[a] - src_box.lo[a]) as usize)), missing);
+        pass.tiles(io, bytes, &gone);
+    }
+}
+
+/// One sweep of one brick.
+struct Pass<'a, K> {
+    prepared: &'a Prepared,
+    level: Level,
+    /// Nothing is greater than anything.
+    flat: bool,
+    volumes: [&'a [K]; 2],
+    src_box: Region,
+    dst_box: Region,
+    buffers: Buffers<'a, K>,
+}
+
+impl<K: Key> Pass<'_, K> {
+    fn tiles(&mut self, io: ObscuranceIo, bytes: &mut [u8], gone: &dyn Fn([i64; 3]) -> bool) {
+        let ObscuranceIo { colour, normal, openness, rgb } = io;
+        let mut openness = openness.map(f32_view);
+        let mut rgb = rgb.map(|views| views.map(f32_view));
+        assert!(rgb.is_none() || colour.is_some(), "rgb needs colours");
+        let fast = openness.is_some() && normal.is_none();
+        let weighted = rgb.is_some() || normal.is_some();
+        let dst_box = self.dst_box;
+        let cells = dst_box.cells(dst_box.lo, TILE);
+        for cell in cells.iter() {
+            let tile = Region::of_cell(cell, dst_box.lo, TILE).clip(&dst_box);
+            let voxels = tile.voxels();
+            let (sums, rest) = carve_all::<u32, 2>(&mut *bytes, if fast { voxels } else { 0 });
+            let (wide, _) = carve_all::<i64, 5>(rest, if weighted { voxels } else { 0 });
+            let mut fast_sum = OpenSum { level: self.level, sums, tile };
+            fast_sum.clear();
+            let [weights, open, red, green, blue] = wide;
+            let mut wide_sum = WeightedSum {
+                tile,
+                dst_box,
+                src_box: self.src_box,
+                normal,
+                flipped: self.prepared.params.flipped,
+                weights,
+                open,
+                ambient: self.prepared.params.ambient,
+                colour: colour.filter(|_| rgb.is_some()),
+                rgb: [red, green, blue],
+            };
+            wide_sum.clear();
+            match (fast, weighted) {
+                (true, false) if self.flat => {}
+                (true, false) => self.sweep_tile(tile, &mut fast_sum),
+                (false, true) => self.sweep_tile(tile, &mut wide_sum),
+                (true, true) => {
+                    let mut both = (fast_sum, wide_sum);
+                    self.sweep_tile(tile, &mut both);
+                    (fast_sum, wide_sum) = both;
+                }
+                (false, false) => return,
+            }
+            if fast && !self.flat {
+                fast_sum.merge();
+            }
+            let total = self.prepared.total;
+            for (i, p) in tile.iter().enumerate() {
+                let at: [usize; 3] = std::array::from_fn(|a| (p[a] - dst_box.lo[a]) as usize);
+                let gone = gone(p);
+                if let Some(out) = &mut openness {
+                    let value = match fast {
+                        true if self.flat => 1.0,
+                        true => fast_sum.openness(i, total),
+                        false => wide_sum.openness(i),
+                    };
+                    out.set(at, if gone { f32::NAN } else { value });
+                }
+                if let Some(out) = &mut rgb {
+                    for (out, value) in out.iter_mut().zip(wide_sum.colour_of(i)) {
+                        out.set(at, if gone { f32::NAN } else { value });
+                    }
+                }
+            }
+        }
+    }
+
+    fn sweep_tile<S: Sink>(&mut self, tile: Region, sink: &mut S) {
+        for family in &self.prepared.families {
+            // Answers are "open" wherever nothing is in reach.
+            let reach = if self.flat { 0 } else { driver::reach_in(family, self.src_box.shape()[family.axis]) };
+            let frame = usize::from(family.axis == 2);
+            let volume = Volume::new(self.volumes[frame], in_frame(self.src_box, FRAMES[frame]));
+            driver::sweep_family(self.level, family, reach, volume, tile, &mut self.buffers, sink);
+        }
+    }
+}
+
+fn f32_view(view: AnyViewMut) -> ViewMut<f32> {
+    match view {
+        AnyViewMut::F32(v) => v,
+        other => panic!("obscurance writes f32, not {}", other.dtype()),
+    }
+}
+
+/// Elements of the parts of the scratch.
+struct Sizes {
+    /// Padded copies: natural, and with x and z exchanged.
+    keys: [usize; 2],
+    /// Voxels of a tile.
+    tile: usize,
+    /// Planes of a sheet.
+    sheet: usize,
+    /// Planes of a sheet that belong to the tile.
+    queries: usize,
+    /// Longest axis of the source.
+    extent: usize,
+}
+
+impl Sizes {
+    fn bytes(&self, key: usize, colour: bool, normal: bool) -> usize {
+        let line = |bytes: usize| bytes.next_multiple_of(64);
+        line(self.keys[0] * key)
+            + line(self.keys[1] * key)
+            + line(self.sheet * LANES * key)
+            + 2 * line(self.queries * LANES * 4)
+            + line(self.sheet * 4)
+            + 2 * line(self.extent * 4)
+            + 2 * line((self.extent + 1) * 4)
+            + if normal { 0 } else { 2 * line(self.tile * 4) }
+            + if normal || colour { 5 * line(self.tile * 8) } else { 0 }
+    }
+}
+
+/// Cuts `len` elements off the front of a slice that is aligned to 64 bytes.
+fn carve<T: Plain>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
+    let (head, tail) = bytes.split_at_mut((len * size_of::<T>()).next_multiple_of(64));
+    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
+    // SAFETY: aligned (just checked), long enough, and every bit pattern is valid for the integers that are `Plain`.
+    (unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }, tail)
+}
+
+fn carve_all<T: Plain, const N: usize>(mut bytes: &mut [u8], len: usize) -> ([&mut [T]; N], &mut [u8]) {
+    let parts = std::array::from_fn(|_| {
+        let (part, rest) = carve(std::mem::take(&mut bytes), len);
+        bytes = rest;
+        part
+    });
+    (parts, bytes)
 }

@@ -1,23 +1,59 @@
 //! Volumes that can be read: anything that reports a lattice and fills a box of it.
+//!
+//! A header parser (`raw`, `nifti`, `nrrd`, `metaimage`, `tiff`) says where the voxels lie; `planar` maps the file, or
+//! unpacks it once, and `lattice` copies boxes. `zarr` reads chunk by chunk, `synthetic` computes.
 
-use std::path::Path;
+mod bytes;
+mod detect;
+mod identity;
+mod lattice;
+mod metaimage;
+mod nifti;
+mod nrrd;
+mod parts;
+mod planar;
+mod raw;
+mod reblock;
+mod shards;
+mod spool;
+mod synthetic;
+mod tiff;
+mod tiff_text;
+pub mod units;
+mod zarr;
+mod zarr_meta;
+
+use std::path::{Path, PathBuf};
 
 use super::VolumeInfo;
-use crate::Result;
 use crate::brick::Voxels;
-use crate::config::Input;
-use crate::grid::{AnyViewMut, Region};
+use crate::config::{Input, InputKind};
+use crate::grid::{Affine, AnyViewMut, Region, Shape, ViewMut};
+use crate::kernel::simd::Level;
+use crate::{Error, Result};
+use detect::Format;
+use lattice::Lattice;
+use planar::{Planar, components, key};
 
 /// An open volume. Reading needs only `&self` and is safe from several threads.
 #[derive(Debug)]
 pub struct Source {
     info: VolumeInfo,
+    kind: Kind,
+    level: Level,
+}
+
+#[derive(Debug)]
+enum Kind {
+    Planar(Planar),
+    Zarr(Box<zarr::ZarrArray>),
+    Synthetic(synthetic::Field),
 }
 
 /// Outcome of [`Source::read_chunk`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ChunkRead {
-    /// The chunk is not stored: every voxel has this stored value.
+    /// The chunk is not stored: every voxel has this stored value (NaN where that is a float's nodata).
     Missing(f64),
     /// Decoded; so many bytes were read from storage.
     Data { stored_bytes: u64 },
@@ -26,8 +62,33 @@ pub enum ChunkRead {
 impl Source {
     /// Opens a volume and reads its header, nothing more.
     pub fn open(input: &Input) -> Result<Source> {
-        let _ = input;
-        todo!()
+        let (info, kind) = match &input.kind {
+            InputKind::Synthetic { field, shape, dtype, seed } => {
+                let (info, field) = synthetic::open(input, field, *shape, *dtype, *seed)?;
+                (info, Kind::Synthetic(field))
+            }
+            InputKind::Path { path, raw } => open_path(input, path, raw.as_ref())?,
+        };
+        let info = overridden(info, input)?;
+        Ok(Source { info, kind, level: Level::detect() })
+    }
+
+    /// A volume in memory. Panics if `voxels` does not have the shape's size or the shape is empty.
+    pub fn from_array(shape: Shape, voxels: Voxels) -> Source {
+        assert_eq!(voxels.len(), shape.iter().product::<usize>(), "{shape:?} voxels are expected");
+        assert!(!voxels.is_empty(), "a volume has at least one voxel");
+        let info = VolumeInfo::plain(shape, voxels.dtype(), "memory");
+        let big = cfg!(target_endian = "big");
+        let lattice = Lattice::dense(shape, voxels.dtype(), big, 0).expect("the voxels fit in memory");
+        Source { info, kind: Kind::Planar(Planar::memory(lattice, voxels)), level: Level::detect() }
+    }
+
+    /// As [`Source::from_array`], with facts of the caller's; `info` keeps the array's shape and type.
+    pub fn from_array_with(info: VolumeInfo, voxels: Voxels) -> Source {
+        let mut source = Source::from_array(info.shape, voxels);
+        let dtype = source.info.dtype;
+        source.info = VolumeInfo { dtype, components: 1, chunk: None, ..info };
+        source
     }
 
     pub fn info(&self) -> &VolumeInfo {
@@ -36,37 +97,203 @@ impl Source {
 
     /// Bytes of scratch disk that [`Source::prepare`] needs (0 for sources that are read in place).
     pub fn spool_bytes(&self) -> u64 {
-        todo!()
+        match &self.kind {
+            Kind::Planar(planar) => planar.spool_bytes(),
+            Kind::Zarr(_) | Kind::Synthetic(_) => 0,
+        }
     }
 
     /// Makes the voxels addressable: unpacks gzip or re-blocks compressed planes once, streaming, into `scratch`
-    /// (an existing folder). `progress` is told the bytes done and may return false to stop.
+    /// (an existing folder). The scratch file has no name, so nothing is left behind even after a kill. `progress` is
+    /// told the bytes done and may return false to stop. Does nothing the second time.
     pub fn prepare(&mut self, scratch: &Path, progress: &dyn Fn(u64) -> bool) -> Result<()> {
-        let _ = (scratch, progress);
-        todo!()
+        match &mut self.kind {
+            Kind::Planar(planar) => planar.prepare(scratch, progress),
+            Kind::Zarr(_) | Kind::Synthetic(_) => Ok(()),
+        }
     }
 
     /// Fills `dst` (shape and stored type of the box) with stored values; float nodata becomes NaN. Returns the bytes read
-    /// from storage. For sources without chunks (`info().chunk` is `None`).
-    pub fn read(&self, component: usize, region: Region, dst: AnyViewMut) -> Result<u64> {
-        let _ = (component, region, dst);
-        todo!()
+    /// from storage. Sources with chunks decode every chunk that the box touches: [`Source::read_chunk`] lets the caller
+    /// keep them.
+    pub fn read(&self, component: usize, region: Region, mut dst: AnyViewMut) -> Result<u64> {
+        let inside = Region::whole(self.info.shape).contains(&region) && component < self.info.components;
+        if !inside || dst.shape() != region.shape() || dst.dtype() != self.info.dtype {
+            return Err(Error::Failed(format!(
+                "box {region:?} of component {component} cannot be read from {} component(s) of {:?} {} into {:?} {}",
+                self.info.components,
+                self.info.shape,
+                self.info.dtype,
+                dst.shape(),
+                dst.dtype()
+            )));
+        }
+        let bytes = match &self.kind {
+            Kind::Planar(planar) => planar.read(self.level, component, region, reborrow(&mut dst))?,
+            Kind::Zarr(array) => array.read(component, region, &self.info, reborrow(&mut dst))?,
+            Kind::Synthetic(field) => {
+                field.read(region, reborrow(&mut dst));
+                0
+            }
+        };
+        if let Some(nodata) = self.info.nodata {
+            lattice::mark_missing(&mut dst, nodata);
+        }
+        Ok(bytes)
     }
 
     /// Decodes one whole chunk (edge chunks have the full chunk shape; voxels beyond the volume are undefined) into `dst`,
     /// which has the stored type and one chunk's voxels. Float nodata becomes NaN.
     pub fn read_chunk(&self, component: usize, chunk: [i64; 3], dst: &mut Voxels) -> Result<ChunkRead> {
-        let _ = (component, chunk, dst);
-        todo!()
+        let (Kind::Zarr(array), Some(shape)) = (&self.kind, self.info.chunk) else {
+            return Err(Error::Failed(format!("{} has no chunks", self.info.format)));
+        };
+        let mut read = array.read_chunk(component, chunk, dst)?;
+        if let Some(nodata) = self.info.nodata.filter(|_| self.info.dtype.is_float()) {
+            match &mut read {
+                ChunkRead::Missing(fill) if *fill == nodata => *fill = f64::NAN,
+                ChunkRead::Missing(_) => {}
+                ChunkRead::Data { .. } => lattice::mark_missing(&mut dst.view_mut(shape), nodata),
+            }
+        }
+        Ok(read)
     }
 
-    /// The pages of this box will not be wanted again soon.
+    /// The pages of this box will not be wanted again soon. Acts on boxes of whole z planes of mapped files.
     pub fn release(&self, region: Region) {
-        let _ = region;
+        if let Kind::Planar(planar) = &self.kind {
+            planar.release(region);
+        }
     }
 
-    /// Size, metadata and hashed samples: changes when the input does.
+    /// Size, metadata and hashed samples: changes when the input does, and does not depend on its path.
     pub fn identity(&self) -> Result<serde_json::Value> {
-        todo!()
+        let info = &self.info;
+        match &self.kind {
+            Kind::Planar(planar) => planar.identity(&info.format),
+            Kind::Zarr(array) => identity::of_zarr(&info.format, array),
+            Kind::Synthetic(field) => Ok(serde_json::json!({
+                "format": info.format,
+                "shape": field.shape,
+                "dtype": field.dtype.name(),
+                "seed": field.seed,
+            })),
+        }
+    }
+
+    /// Files and folders that the volume is read from.
+    pub fn paths(&self) -> Vec<PathBuf> {
+        match &self.kind {
+            Kind::Planar(planar) => planar.paths.clone(),
+            Kind::Zarr(array) => vec![array.folder().to_path_buf()],
+            Kind::Synthetic(_) => Vec::new(),
+        }
+    }
+}
+
+fn open_path(input: &Input, path: &Path, raw: Option<&crate::config::RawFormat>) -> Result<(VolumeInfo, Kind)> {
+    let format = match raw {
+        Some(_) => None,
+        None => Some(detect::detect(path)?),
+    };
+    if format == Some(Format::Zarr) {
+        let (info, array) = zarr::open(input, path)?;
+        return Ok((info, Kind::Zarr(Box::new(array))));
+    }
+    if input.level != 0 {
+        let text = format!("{}: only OME-Zarr images have levels; {} has level 0", input.level, path.display());
+        return Err(Error::config(key(input, "level"), text));
+    }
+    if let Some(name) = &input.array {
+        let text = format!("`{name}`: only Zarr groups have named arrays; {} is none", path.display());
+        return Err(Error::config(key(input, "array"), text));
+    }
+    let parsed = match (raw, format) {
+        (Some(raw), _) => raw::open_raw(input, path, raw)?,
+        (_, Some(Format::Nifti)) => nifti::open(input, path)?,
+        (_, Some(Format::Nrrd)) => nrrd::open(input, path)?,
+        (_, Some(Format::MetaImage)) => metaimage::open(input, path)?,
+        (_, Some(Format::Tiff)) => tiff::open(input, path)?,
+        _ => raw::open_npy(path)?,
+    };
+    if raw.is_some() || format == Some(Format::Npy) {
+        components(input, 1, 1, &[])?;
+    }
+    let (info, planar) = Planar::new(parsed)?;
+    Ok((info, Kind::Planar(planar)))
+}
+
+/// Applies what the config says over what the file says, and checks what is used.
+fn overridden(mut info: VolumeInfo, input: &Input) -> Result<VolumeInfo> {
+    let sane = |v: &f64| v.is_finite() && *v > 0.0;
+    if let Some(spacing) = input.spacing {
+        if !spacing.iter().all(sane) {
+            return Err(Error::config(
+                key(input, "spacing"),
+                format!("{spacing:?}: three positive numbers, z, y, x, are expected"),
+            ));
+        }
+        info.spacing = spacing;
+    }
+    if !info.spacing.iter().all(sane) {
+        let place = match &input.kind {
+            InputKind::Path { path, .. } => path.clone(),
+            InputKind::Synthetic { .. } => PathBuf::new(),
+        };
+        let text = format!(
+            "the spacing in the header (z, y, x) is {:?}, which is not positive; give the input spacing = [z, y, x]",
+            info.spacing
+        );
+        return Err(Error::file(place, text));
+    }
+    if let Some(unit) = &input.unit {
+        info.unit = units::normalise(unit);
+    }
+    if let Some(orientation) = &info.orientation {
+        info.origin = straight_origin(&orientation.matrix).unwrap_or([0.0; 3]);
+    }
+    if let Some(origin) = input.origin {
+        if !origin.iter().all(|v| v.is_finite()) {
+            return Err(Error::config(
+                key(input, "origin"),
+                format!("{origin:?}: three numbers, z, y, x, are expected"),
+            ));
+        }
+        info.origin = origin;
+    }
+    if !info.origin.iter().all(|v| v.is_finite()) {
+        info.origin = [0.0; 3];
+    }
+    if input.slope.is_some() || input.intercept.is_some() {
+        let slope = input.slope.unwrap_or(info.affine.slope);
+        info.affine = Affine::new(slope, input.intercept.unwrap_or(info.affine.intercept));
+    }
+    info.nodata = input.nodata.or(info.nodata);
+    Ok(info)
+}
+
+/// Origin `[z, y, x]` of a direction matrix that is diagonal and positive (to rounding); `None` otherwise.
+fn straight_origin(matrix: &[[f64; 4]; 3]) -> Option<[f64; 3]> {
+    let straight = (0..3).all(|r| {
+        let least = 1e-6 * matrix[r][r];
+        matrix[r][r] > 0.0 && (0..3).all(|c| c == r || matrix[r][c].abs() <= least)
+    });
+    straight.then(|| [matrix[2][3], matrix[1][3], matrix[0][3]])
+}
+
+/// A shorter borrow of the same voxels.
+fn reborrow<'a>(dst: &'a mut AnyViewMut<'_>) -> AnyViewMut<'a> {
+    fn again<'a, T>(v: &'a mut ViewMut<'_, T>) -> ViewMut<'a, T> {
+        v.reborrow()
+    }
+    match dst {
+        AnyViewMut::U8(v) => AnyViewMut::U8(again(v)),
+        AnyViewMut::I8(v) => AnyViewMut::I8(again(v)),
+        AnyViewMut::U16(v) => AnyViewMut::U16(again(v)),
+        AnyViewMut::I16(v) => AnyViewMut::I16(again(v)),
+        AnyViewMut::U32(v) => AnyViewMut::U32(again(v)),
+        AnyViewMut::I32(v) => AnyViewMut::I32(again(v)),
+        AnyViewMut::F32(v) => AnyViewMut::F32(again(v)),
+        AnyViewMut::F64(v) => AnyViewMut::F64(again(v)),
     }
 }

@@ -1,0 +1,132 @@
+//! Times gradient, Gaussian, exact rank and the occlusion-map chain on one core: ns per output voxel, Mvoxel/s, and the
+//! multiple of the time that memcpy takes for the same voxels of a 256^3 volume in this process. Each kernel's result on
+//! this CPU's level is compared with that of the portable code first.
+//!
+//! `cargo bench --bench kernels_more [-- FILTER]`
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use occlude::brick::{Scratch, Voxels};
+use occlude::grid::{Affine, AnyView, DType, Shape, Voxel};
+use occlude::kernel::Context;
+use occlude::kernel::gradient::{GradientOut, gradient};
+use occlude::kernel::rank::rank;
+use occlude::kernel::simd::Level;
+use occlude::stage::{GradientWeight, Ties, WindowParams, WindowShape};
+
+/// Voxels of the output box: rows as a brick of the planner has them.
+const BOX: Shape = [64, 64, 256];
+
+fn main() {
+    let filter = std::env::args().skip(1).find(|a| !a.starts_with("--")).unwrap_or_default();
+    println!("{:<44} {:>10} {:>10} {:>9}", "kernel", "ns/voxel", "Mvoxel/s", "memcpys");
+    for dtype in [DType::U8, DType::U16, DType::F32] {
+        let copy = memcpy_ns(dtype);
+        let row = |name: String, mut job: Job| {
+            let name = format!("{name} {dtype}");
+            if name.contains(&filter) {
+                report(&name, copy, &mut job);
+            }
+        };
+        for (window, radius) in [(WindowShape::Box, 5), (WindowShape::Box, 10), (WindowShape::Ball, 5)] {
+            row(format!("rank {window:?} radius {radius}"), rank_job(dtype, window, radius));
+        }
+        for size in [3, 5] {
+            row(format!("gradient {size}^3 magnitude"), gradient_job(dtype, size));
+        }
+    }
+}
+
+/// Least seconds of several runs.
+fn best(mut f: impl FnMut()) -> f64 {
+    let start = Instant::now();
+    let mut least = f64::INFINITY;
+    let mut runs = 0;
+    while runs < 3 || start.elapsed().as_secs_f64() < 0.4 {
+        let one = Instant::now();
+        f();
+        least = least.min(one.elapsed().as_secs_f64());
+        runs += 1;
+    }
+    least
+}
+
+/// Nanoseconds per voxel of copying a 256^3 volume between warm buffers.
+fn memcpy_ns(dtype: DType) -> f64 {
+    let bytes = 256 * 256 * 256 * dtype.size();
+    let (from, mut to) = (vec![1u8; bytes], vec![2u8; bytes]);
+    let seconds = best(|| {
+        to.copy_from_slice(black_box(&from));
+        black_box(&mut to);
+    });
+    seconds * 1e9 / (256.0 * 256.0 * 256.0)
+}
+
+fn report(name: &str, copy: f64, job: &mut Job) {
+    let level = Level::detect();
+    job.run(Level::Baseline);
+    let portable = job.out.clone();
+    job.run(level);
+    assert!(job.out.as_bytes() == portable.as_bytes(), "{name}: {level:?} differs from the portable code");
+    let ns = best(|| job.run(level)) * 1e9 / BOX.iter().product::<usize>() as f64;
+    println!("{name:<44} {ns:>10.3} {:>10.1} {:>9.1}", 1e3 / ns, ns / copy);
+}
+
+/// A smooth field with noise, grown by `reach` on every side.
+fn field(dtype: DType, reach: [usize; 3]) -> (Voxels, Shape) {
+    fn fill<T: Voxel>(v: &mut [T], shape: Shape, top: f64) {
+        let mut state = 12345u64;
+        for (i, v) in v.iter_mut().enumerate() {
+            let (z, y, x) = (i / (shape[1] * shape[2]), i / shape[2] % shape[1], i % shape[2]);
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            let noise = (state >> 33) as f64 / (1u64 << 31) as f64;
+            let wave = (z as f64 * 0.11).sin() + (y as f64 * 0.07).sin() + (x as f64 * 0.05).cos();
+            *v = T::from_f64((wave / 6.0 + 0.5).mul_add(0.9, noise * 0.08) * top);
+        }
+    }
+    let shape: Shape = std::array::from_fn(|a| BOX[a] + 2 * reach[a]);
+    let mut v = Voxels::zeroed(dtype, shape.iter().product());
+    let top = if dtype == DType::U16 { 65535.0 } else { 255.0 };
+    occlude::with_voxels!(&mut v, v => fill(v, shape, top));
+    (v, shape)
+}
+
+/// One timed kernel: its source, its buffers, and the call.
+struct Job<'a> {
+    src: (Voxels, Shape),
+    reach: [usize; 3],
+    out: Voxels,
+    scratch: Scratch,
+    kernel: Box<dyn FnMut(AnyView, [usize; 3], &mut Voxels, &mut Context) + 'a>,
+}
+
+impl<'a> Job<'a> {
+    fn new(
+        dtype: DType,
+        reach: [usize; 3],
+        kernel: impl FnMut(AnyView, [usize; 3], &mut Voxels, &mut Context) + 'a,
+    ) -> Job<'a> {
+        let out = Voxels::zeroed(dtype.result(), BOX.iter().product());
+        Job { src: field(dtype, reach), reach, out, scratch: Scratch::new(), kernel: Box::new(kernel) }
+    }
+
+    fn run(&mut self, level: Level) {
+        let mut cx = Context { level, scratch: &mut self.scratch };
+        (self.kernel)(self.src.0.view(self.src.1), self.reach, &mut self.out, &mut cx);
+    }
+}
+
+fn gradient_job<'a>(dtype: DType, size: usize) -> Job<'a> {
+    Job::new(dtype, [size / 2; 3], move |src, at, out, cx| {
+        let out = GradientOut { magnitude: Some(out.view_mut(BOX)), vector: None };
+        gradient(src, size, GradientWeight::Distance, [1.0; 3], Affine::IDENTITY, None, at, out, cx);
+    })
+}
+
+fn rank_job<'a>(dtype: DType, window: WindowShape, radius: usize) -> Job<'a> {
+    let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
+    Job::new(dtype, [radius; 3], move |src, at, out, cx| {
+        rank(src, &params, window, Ties::Le, at, out.view_mut(BOX), cx);
+    })
+}

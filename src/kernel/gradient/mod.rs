@@ -1,0 +1,385 @@
+//! Gradients by 4-D linear regression (paper N, as used in B 4).
+//!
+//! Over a full window the regression's normal equations are diagonal, so each component is
+//! `sum_k w_k f_k x_k / sum_k w_k x_k^2`. The weights depend on `|x_k|` only: voxels that mirror each other share one, and
+//! are subtracted or added before they are weighed. Along y and z that happens on whole rows (in i32 for types of up to 16
+//! bits, which is exact), along x in registers. No fused operations: on a CPU that has them they save little here, and one
+//! that has not would pay fifty times over.
+
+mod regression;
+
+use std::marker::PhantomData;
+
+use super::Context;
+use super::values::missing_as;
+use crate::brick::scratch::{cut, padded};
+use crate::grid::{Affine, AnyView, AnyViewMut, DType, Shape, View, Voxel};
+use crate::stage::GradientWeight;
+use crate::{multiversion, with_view};
+
+/// What to compute. Element types are `src.dtype().result()`.
+#[derive(Default)]
+pub struct GradientOut<'a> {
+    pub magnitude: Option<AnyViewMut<'a>>,
+    /// Components along z, y, x.
+    pub vector: Option<[AnyViewMut<'a>; 3]>,
+}
+
+impl GradientOut<'_> {
+    fn shape(&self) -> Option<Shape> {
+        let magnitude = self.magnitude.iter().map(AnyViewMut::shape);
+        let mut shapes = magnitude.chain(self.vector.iter().flatten().map(AnyViewMut::shape));
+        let first = shapes.next()?;
+        assert!(shapes.all(|s| s == first), "extents differ");
+        Some(first)
+    }
+}
+
+/// Regression over `size`^3 voxels (3 or 5) around each voxel of the output box, which starts at `at` of `src`. `src` holds
+/// the full window of every output voxel (the caller extended it by border `nearest`). `spacing` is physical; components
+/// are scaled by the slope of `affine`. A NaN or `missing` voxel in a window: the full regression over the others; a missing
+/// centre: NaN. Panics if a window sticks out of `src`, or for another size.
+#[allow(clippy::too_many_arguments)]
+pub fn gradient(
+    src: AnyView,
+    size: usize,
+    weight: GradientWeight,
+    spacing: [f64; 3],
+    affine: Affine,
+    missing: Option<i64>,
+    at: [usize; 3],
+    mut out: GradientOut,
+    cx: &mut Context,
+) {
+    assert!(size == 3 || size == 5, "a gradient window has 3 or 5 voxels per axis");
+    let half = size / 2;
+    let Some(shape) = out.shape() else { return };
+    let from = src.shape();
+    assert!((0..3).all(|a| at[a] >= half && at[a] + shape[a] + half <= from[a]), "a window sticks out of the source");
+    let table = &Table::new(half, weight, spacing);
+    let scratch = cx.scratch.take(scratch_bytes(src.dtype(), from, shape, size));
+    let level = cx.level;
+    macro_rules! run {
+        ($half:literal, $sum:ty, $v:ident, $missing:expr) => {{
+            let job = Job::<$half, $sum> { shape, at, slope: affine.slope, table, sums: PhantomData };
+            planes(level, $v, $missing, &job, &mut out, scratch)
+        }};
+    }
+    macro_rules! choose {
+        ($half:literal, $($small:ident),*) => {
+            match src {
+                $(AnyView::$small(v) if missing.is_none() => run!($half, i32, v, None),)*
+                src => with_view!(AnyView, src, v => run!($half, f64, v, missing_as(missing))),
+            }
+        };
+    }
+    if size == 3 { choose!(1, U8, I8, U16, I16) } else { choose!(2, U8, I8, U16, I16) }
+}
+
+/// Bytes of scratch that [`gradient`] takes at most, whatever the extents.
+pub fn scratch_bytes(_dtype: DType, _src: Shape, _dst: Shape, _size: usize) -> usize {
+    padded::<f64>(SUMS * STRIDE) + padded::<f64>(3 * RUN)
+}
+
+/// Output voxels of a row that are worked on together: their sums stay in the L1 cache.
+const RUN: usize = 128;
+
+/// Weighted columns: 2 for component x, 3 each for y and z.
+const SUMS: usize = 8;
+
+/// What to do everywhere: `H` is the window's half-width, `S` what row sums are kept in.
+struct Job<'a, const H: usize, S> {
+    shape: Shape,
+    at: [usize; 3],
+    slope: f64,
+    table: &'a Table,
+    sums: PhantomData<S>,
+}
+
+/// Weights of one spacing, `H` = half-width.
+struct Table {
+    half: usize,
+    /// `along[a][dz][dy][dx]`: weight of component a at offsets >= 0, divided by its denominator.
+    along: [[[[f64; 3]; 3]; 3]; 3],
+    /// Weight of a voxel by its offsets' magnitudes, for the full regression.
+    weight: [[[f64; 3]; 3]; 3],
+    spacing: [f64; 3],
+}
+
+impl Table {
+    fn new(half: usize, weight: GradientWeight, spacing: [f64; 3]) -> Table {
+        let mut table = Table { half, along: Default::default(), weight: Default::default(), spacing };
+        let mut below = [0.0; 3];
+        let range = 0..=half;
+        for [z, y, x] in range.clone().flat_map(|z| range.clone().flat_map(move |y| (0..=half).map(move |x| [z, y, x])))
+        {
+            let offset = [z as f64 * spacing[0], y as f64 * spacing[1], x as f64 * spacing[2]];
+            let distance = (offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]).sqrt();
+            let w = match weight {
+                _ if [z, y, x] == [0; 3] => 0.0,
+                GradientWeight::Distance => distance,
+                GradientWeight::Inverse => 1.0 / distance,
+            };
+            table.weight[z][y][x] = w;
+            let copies = [z, y, x].iter().map(|&d| if d == 0 { 1.0 } else { 2.0 }).product::<f64>();
+            for a in 0..3 {
+                table.along[a][z][y][x] = w * offset[a];
+                below[a] += copies * w * offset[a] * offset[a];
+            }
+        }
+        for (rows, below) in table.along.iter_mut().zip(below) {
+            rows.iter_mut().flatten().flatten().for_each(|w| *w /= below);
+        }
+        table
+    }
+}
+
+/// What row sums are kept in, made from voxels of type `T`.
+trait Sum<T>: Voxel {
+    fn of(v: T, missing: Option<T>) -> Self;
+    fn plus(self, other: Self) -> Self;
+    fn minus(self, other: Self) -> Self;
+}
+
+macro_rules! exact_in_i32 {
+    ($($t:ty),*) => {$(
+        /// Sums and differences of four such voxels are exact.
+        impl Sum<$t> for i32 {
+            #[inline(always)]
+            fn of(v: $t, _: Option<$t>) -> i32 { v as i32 }
+            #[inline(always)]
+            fn plus(self, other: i32) -> i32 { self.wrapping_add(other) }
+            #[inline(always)]
+            fn minus(self, other: i32) -> i32 { self.wrapping_sub(other) }
+        }
+    )*};
+}
+exact_in_i32!(u8, i8, u16, i16);
+
+impl<T: Voxel> Sum<T> for f64 {
+    #[inline(always)]
+    fn of(v: T, missing: Option<T>) -> f64 {
+        if missing == Some(v) { f64::NAN } else { v.to_f64() }
+    }
+    #[inline(always)]
+    fn plus(self, other: f64) -> f64 {
+        self + other
+    }
+    #[inline(always)]
+    fn minus(self, other: f64) -> f64 {
+        self - other
+    }
+}
+
+multiversion! {
+    fn planes[const H: usize, T: Voxel, S: Sum<T>](
+        src: View<T>, missing: Option<T>, job: &Job<H, S>, out: &mut GradientOut, scratch: &mut [u8],
+    ) -> () = planes_inner::<H, T, S>;
+}
+
+/// Every output voxel, in runs along x.
+#[inline(always)]
+fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
+    src: View<T>,
+    missing: Option<T>,
+    job: &Job<H, S>,
+    out: &mut GradientOut,
+    scratch: &mut [u8],
+) {
+    let (sums, rest) = cut::<f64>(scratch, SUMS * STRIDE);
+    let (parts, _) = cut::<f64>(rest, 3 * RUN);
+    let gaps = T::DTYPE.is_float() || missing.is_some();
+    for z in 0..job.shape[0] {
+        for y in 0..job.shape[1] {
+            for x in (0..job.shape[2]).step_by(RUN) {
+                let n = RUN.min(job.shape[2] - x);
+                let m = n + 2 * H;
+                let centre = [job.at[0] + z, job.at[1] + y, job.at[2] + x];
+                let rows: [[&[T]; 5]; 5] = std::array::from_fn(|dz| {
+                    std::array::from_fn(|dy| {
+                        let (dz, dy) = (dz.min(2 * H), dy.min(2 * H));
+                        &src.row_at(centre[0] + dz - H, centre[1] + dy - H)[centre[2] - H..][..m]
+                    })
+                });
+                let full = m / LANES * LANES;
+                for i in (0..full).step_by(LANES) {
+                    weigh_columns::<H, T, S, true>(&rows, missing, job.table, i, sums);
+                }
+                if full < m {
+                    weigh_columns::<H, T, S, false>(&rows, missing, job.table, full, sums);
+                }
+                join_columns::<H>(sums, parts);
+                if gaps && any_nan(&rows[H][H][H..H + n], missing, n, parts) {
+                    regress_gaps(&src, missing, centre, n, job.table, parts);
+                }
+                store([z, y, x], n, job.slope, parts, out);
+            }
+        }
+    }
+}
+
+/// Elements from one row of sums to the next.
+const STRIDE: usize = RUN + 8;
+
+/// Columns worked on at once: their eight sums stay in registers.
+const LANES: usize = 8;
+
+/// Weighted sums over y and z of [`LANES`] columns from `i` on: for component x one row per |dx| = 1, 2, for y and z one
+/// per |dx| = 0, 1, 2. Without `FULL` the rows may end inside the lanes.
+#[inline(always)]
+fn weigh_columns<const H: usize, T: Voxel, S: Sum<T>, const FULL: bool>(
+    rows: &[[&[T]; 5]; 5],
+    missing: Option<T>,
+    table: &Table,
+    i: usize,
+    sums: &mut [f64],
+) {
+    let row = |dz: usize, dy: usize| -> [S; LANES] {
+        let row = rows[dz][dy];
+        if FULL {
+            let row: &[T; LANES] = row[i..i + LANES].try_into().unwrap();
+            row.map(|v| S::of(v, missing))
+        } else {
+            std::array::from_fn(|l| S::of(row[(i + l).min(row.len() - 1)], missing))
+        }
+    };
+    let mut acc = [[0.0f64; LANES]; SUMS];
+    let mut add = |index: usize, w: f64, sum: &[S; LANES]| {
+        for l in 0..LANES {
+            acc[index][l] += w * sum[l].to_f64();
+        }
+    };
+    let [in_z, in_y, in_x] = &table.along;
+    let c = row(H, H);
+    for dx in 1..=H {
+        add(dx - 1, in_x[0][0][dx], &c);
+    }
+    for d in 1..=H {
+        let (a, b) = (row(H, H + d), row(H, H - d));
+        let (even, odd) = (plus(&a, &b), minus(&a, &b));
+        (1..=H).for_each(|dx| add(dx - 1, in_x[0][d][dx], &even));
+        (0..=H).for_each(|dx| add(2 + dx, in_y[0][d][dx], &odd));
+        let (a, b) = (row(H + d, H), row(H - d, H));
+        let (even, odd) = (plus(&a, &b), minus(&a, &b));
+        (1..=H).for_each(|dx| add(dx - 1, in_x[d][0][dx], &even));
+        (0..=H).for_each(|dx| add(5 + dx, in_z[d][0][dx], &odd));
+    }
+    for dz in 1..=H {
+        for dy in 1..=H {
+            let (pp, pm, mp, mm) = (row(H + dz, H + dy), row(H + dz, H - dy), row(H - dz, H + dy), row(H - dz, H - dy));
+            let even = plus(&plus(&pp, &pm), &plus(&mp, &mm));
+            let odd_y = plus(&minus(&pp, &pm), &minus(&mp, &mm));
+            let odd_z = plus(&minus(&pp, &mp), &minus(&pm, &mm));
+            (1..=H).for_each(|dx| add(dx - 1, in_x[dz][dy][dx], &even));
+            (0..=H).for_each(|dx| add(2 + dx, in_y[dz][dy][dx], &odd_y));
+            (0..=H).for_each(|dx| add(5 + dx, in_z[dz][dy][dx], &odd_z));
+        }
+    }
+    for (index, acc) in acc.iter().enumerate() {
+        sums[index * STRIDE + i..][..LANES].copy_from_slice(acc);
+    }
+}
+
+#[inline(always)]
+fn plus<T, S: Sum<T>>(a: &[S; LANES], b: &[S; LANES]) -> [S; LANES] {
+    std::array::from_fn(|l| a[l].plus(b[l]))
+}
+
+#[inline(always)]
+fn minus<T, S: Sum<T>>(a: &[S; LANES], b: &[S; LANES]) -> [S; LANES] {
+    std::array::from_fn(|l| a[l].minus(b[l]))
+}
+
+/// The three components (z, y, x in turn, [`RUN`] apart) from the weighted columns; past the run's end they are rubbish.
+#[inline(always)]
+fn join_columns<const H: usize>(sums: &[f64], parts: &mut [f64]) {
+    let column =
+        |index: usize, from: usize| -> &[f64; RUN] { sums[index * STRIDE + from..][..RUN].try_into().unwrap() };
+    let (parts_zy, gx) = parts.split_at_mut(2 * RUN);
+    let (a, b) = (column(0, H + 1), column(0, H - 1));
+    (0..RUN).for_each(|i| gx[i] = a[i] - b[i]);
+    if H == 2 {
+        let (a, b) = (column(1, 4), column(1, 0));
+        (0..RUN).for_each(|i| gx[i] += a[i] - b[i]);
+    }
+    for (g, first) in parts_zy.chunks_exact_mut(RUN).zip([5, 2]) {
+        let (c, a, b) = (column(first, H), column(first + 1, H + 1), column(first + 1, H - 1));
+        (0..RUN).for_each(|i| g[i] = c[i] + (a[i] + b[i]));
+        if H == 2 {
+            let (a, b) = (column(first + 2, 4), column(first + 2, 0));
+            (0..RUN).for_each(|i| g[i] += a[i] + b[i]);
+        }
+    }
+}
+
+/// Whether a centre is missing or a component NaN.
+#[inline(always)]
+fn any_nan<T: Voxel>(centres: &[T], missing: Option<T>, n: usize, parts: &[f64]) -> bool {
+    let mut any = false;
+    for v in centres {
+        let v = <f64 as Sum<T>>::of(*v, missing);
+        any |= v.is_nan();
+    }
+    for g in parts.chunks_exact(RUN) {
+        for g in &g[..n] {
+            any |= g.is_nan();
+        }
+    }
+    any
+}
+
+/// Puts the full regression where a voxel of the window is missing. A missing voxel makes a component NaN, since each but
+/// the centre has a weight in one at least.
+#[inline(never)]
+fn regress_gaps<T: Voxel>(
+    src: &View<T>,
+    missing: Option<T>,
+    [z, y, x]: [usize; 3],
+    n: usize,
+    table: &Table,
+    parts: &mut [f64],
+) {
+    let value = |z: usize, y: usize, x: usize| <f64 as Sum<T>>::of(src.at([z, y, x]), missing);
+    for i in 0..n {
+        let gone = value(z, y, x + i).is_nan();
+        if !gone && !(0..3).any(|a| parts[a * RUN + i].is_nan()) {
+            continue;
+        }
+        let fitted = if gone { Some([f64::NAN; 3]) } else { regression::fit(table, [z, y, x + i], value) };
+        if let Some(g) = fitted {
+            (0..3).for_each(|a| parts[a * RUN + i] = g[a]);
+        }
+    }
+}
+
+/// Scales, rounds once and stores `n` voxels from voxel `[z, y, x]` of the outputs on.
+#[inline(always)]
+fn store([z, y, x]: [usize; 3], n: usize, slope: f64, parts: &mut [f64], out: &mut GradientOut) {
+    #[inline(always)]
+    fn put(dst: &mut AnyViewMut, [z, y, x]: [usize; 3], n: usize, value: impl Fn(usize) -> f64) {
+        match dst {
+            AnyViewMut::F32(d) => {
+                d.row_at(z, y)[x..x + n].iter_mut().enumerate().for_each(|(i, d)| *d = value(i) as f32);
+            }
+            AnyViewMut::F64(d) => {
+                d.row_at(z, y)[x..x + n].iter_mut().enumerate().for_each(|(i, d)| *d = value(i));
+            }
+            other => panic!("a gradient is not {}", other.dtype()),
+        }
+    }
+    // + 0.0 makes a zero positive whatever the slope
+    parts.iter_mut().for_each(|p| *p = *p * slope + 0.0);
+    let (gz, rest) = parts.split_at(RUN);
+    let (gy, gx) = rest.split_at(RUN);
+    if let Some(dst) = &mut out.magnitude {
+        put(dst, [z, y, x], n, |i| (gz[i] * gz[i] + gy[i] * gy[i] + gx[i] * gx[i]).sqrt());
+    }
+    if let Some(vector) = &mut out.vector {
+        for (dst, g) in vector.iter_mut().zip([gz, gy, gx]) {
+            put(dst, [z, y, x], n, |i| g[i]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

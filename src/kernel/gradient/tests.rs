@@ -1,0 +1,167 @@
+use super::*;
+use crate::brick::{Scratch, Voxels};
+use crate::grid::Region;
+use crate::kernel::hostile::{Noise, calm};
+use crate::kernel::simd::Level;
+
+const WEIGHTS: [GradientWeight; 2] = [GradientWeight::Distance, GradientWeight::Inverse];
+
+/// Magnitude, z, y, x of every voxel whose window lies in `v`, on one level, in one box of outputs.
+fn run(
+    v: &Voxels,
+    shape: Shape,
+    part: Region,
+    level: Level,
+    job: (usize, GradientWeight, [f64; 3], Affine),
+) -> [Vec<f64>; 4] {
+    let (size, weight, spacing, affine) = job;
+    let grown = part.grow([size / 2; 3]);
+    let mut brick = Voxels::zeroed(v.dtype(), grown.voxels());
+    crate::brick::gather::copy_common(v.view(shape), Region::whole(shape), brick.view_mut(grown.shape()), grown);
+    let result = v.dtype().result();
+    let mut outs: [Voxels; 4] = std::array::from_fn(|_| Voxels::zeroed(result, part.voxels()));
+    let [m, z, y, x] = &mut outs;
+    let n = part.shape();
+    let out =
+        GradientOut { magnitude: Some(m.view_mut(n)), vector: Some([z.view_mut(n), y.view_mut(n), x.view_mut(n)]) };
+    let (mut scratch, at) = (Scratch::new(), [size / 2; 3]);
+    let mut cx = Context { level, scratch: &mut scratch };
+    gradient(brick.view(grown.shape()), size, weight, spacing, affine, Some(90), at, out, &mut cx);
+    outs.map(|o| (0..o.len()).map(|i| o.at(i)).collect())
+}
+
+/// Weighted least squares by the 4x4 normal equations, as section 4 of the specification states it.
+fn reference(v: &dyn Fn([i64; 3]) -> f64, half: i64, weight: GradientWeight, spacing: [f64; 3]) -> [f64; 3] {
+    if v([0; 3]).is_nan() {
+        return [f64::NAN; 3];
+    }
+    let mut m = [[0.0f64; 5]; 4];
+    for d in Region::new([-half; 3], [half + 1; 3]).iter() {
+        let offset: [f64; 3] = std::array::from_fn(|a| d[a] as f64 * spacing[a]);
+        let distance = offset.iter().map(|o| o * o).sum::<f64>().sqrt();
+        let f = v(d);
+        if d == [0; 3] || f.is_nan() {
+            continue;
+        }
+        let w = if weight == GradientWeight::Distance { distance } else { 1.0 / distance };
+        let row = [offset[0], offset[1], offset[2], 1.0, f];
+        for i in 0..4 {
+            for j in 0..5 {
+                m[i][j] += w * row[i] * row[j];
+            }
+        }
+    }
+    let scale = m[0][0].max(m[1][1]).max(m[2][2]).max(m[3][3]);
+    for p in 0..4 {
+        let best = (p..4).max_by(|&i, &j| m[i][p].abs().total_cmp(&m[j][p].abs())).unwrap();
+        m.swap(p, best);
+        if m[p][p].abs() <= 1e-10 * scale {
+            return [0.0; 3];
+        }
+        for i in 0..4 {
+            if i != p {
+                let factor = m[i][p] / m[p][p];
+                let pivot = m[p];
+                m[i].iter_mut().zip(pivot).for_each(|(a, b)| *a -= factor * b);
+            }
+        }
+    }
+    std::array::from_fn(|i| m[i][4] / m[i][i])
+}
+
+fn close(got: f64, expect: f64, scale: f64) -> bool {
+    (got - expect).abs() <= 2e-7 * scale.max(expect.abs()) || got.is_nan() && expect.is_nan()
+}
+
+#[test]
+fn equals_the_regression_for_every_type_level_and_brick() {
+    let shape = [8, 7, 45];
+    for (case, dtype) in DType::ALL.into_iter().enumerate() {
+        for gaps in [false, true] {
+            let mut v = calm(dtype, shape, case as u64);
+            if !gaps {
+                crate::with_voxels!(&mut v, v => v.iter_mut().filter(|v| v.to_f64() == 90.0).for_each(|v| *v = Voxel::from_f64(3.0)));
+            } else if dtype.is_float() {
+                let mut noise = Noise(5);
+                let n = v.len();
+                let dense = n / 2;
+                for i in 0..n {
+                    if noise.below(if i < dense { 40 } else { 2 }) == 0 {
+                        crate::with_voxels!(&mut v, v => v[i] = Voxel::from_f64(f64::NAN));
+                    }
+                }
+            }
+            for (size, weight) in [3, 5].into_iter().flat_map(|s| WEIGHTS.map(|w| (s, w))) {
+                let half = size as i64 / 2;
+                let (spacing, affine) = ([2.0, 1.0, 0.7], Affine::new(-0.5, 4.0));
+                let inner = Region::new([half; 3], shape.map(|n| n as i64 - half));
+                let job = (size, weight, spacing, affine);
+                let got = run(&v, shape, inner, Level::Baseline, job);
+                for (i, p) in inner.iter().enumerate() {
+                    let at = |d: [i64; 3]| {
+                        let q: [usize; 3] = std::array::from_fn(|a| (p[a] + d[a]) as usize);
+                        let value = v.at((q[0] * shape[1] + q[1]) * shape[2] + q[2]);
+                        if !dtype.is_float() && value == 90.0 { f64::NAN } else { value }
+                    };
+                    let expect = reference(&at, half, weight, spacing).map(|g| g * -0.5);
+                    let magnitude = expect.iter().map(|g| g * g).sum::<f64>().sqrt();
+                    assert!(close(got[0][i], magnitude, 50.0), "{dtype} {size} {p:?}: {} {magnitude}", got[0][i]);
+                    for a in 0..3 {
+                        assert!(close(got[a + 1][i], expect[a], 50.0), "{dtype} {size} {weight:?} {p:?} axis {a}");
+                    }
+                }
+                for level in Level::available() {
+                    for edge in [3, 64] {
+                        for cell in inner.cells([1; 3], [edge; 3]).iter() {
+                            let part = Region::of_cell(cell, [1; 3], [edge; 3]).clip(&inner);
+                            let brick = run(&v, shape, part, level, job);
+                            for (j, p) in part.iter().enumerate() {
+                                let o = inner.offset_of(&Region::new(p, p));
+                                let n = inner.shape();
+                                let i = (o[0] * n[1] + o[1]) * n[2] + o[2];
+                                for c in 0..4 {
+                                    assert_eq!(brick[c][j].to_bits(), got[c][i].to_bits(), "{dtype} {level:?} {p:?}");
+                                }
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn constants_give_zero_and_planes_their_slope() {
+    let shape = [5, 5, 40];
+    let inner = Region::new([2, 2, 2], [3, 3, 38]);
+    for level in Level::available() {
+        for weight in WEIGHTS {
+            let job = (5, weight, [1.0, 1.0, 2.0], Affine::new(-3.0, 0.0));
+            for (dtype, value) in [(DType::U8, 255.0), (DType::F32, 0.1), (DType::F64, 1e300), (DType::I32, -7.0)] {
+                let got = run(&crate::kernel::hostile::constant(dtype, shape, value), shape, inner, level, job);
+                assert!(got.iter().flatten().all(|g| g.to_bits() == 0), "{dtype}: {got:?}");
+            }
+            let ramp = Voxels::I16((0..1000).map(|i| (i % 40) - 30 * ((i / 40) % 5)).collect());
+            let got = run(&ramp, shape, inner, level, job);
+            for i in 0..36 {
+                assert_eq!([got[1][i], got[3][i]], [0.0, -1.5]);
+                assert!((got[2][i] - 90.0).abs() < 1e-5);
+            }
+        }
+    }
+}
+
+#[test]
+fn an_infinity_changes_only_windows_that_hold_it() {
+    let shape = [5, 5, 60];
+    let calm = calm(DType::F32, shape, 9);
+    let mut hostile = calm.clone();
+    crate::with_voxels!(&mut hostile, v => v[2 * 300 + 2 * 60 + 20] = Voxel::from_f64(f64::INFINITY));
+    let inner = Region::new([2, 2, 2], [3, 3, 58]);
+    let job = (5, GradientWeight::Distance, [1.0; 3], Affine::IDENTITY);
+    let (a, b) = (run(&calm, shape, inner, Level::detect(), job), run(&hostile, shape, inner, Level::detect(), job));
+    for i in 0..56 {
+        assert_eq!(a[0][i].to_bits() == b[0][i].to_bits(), i + 2 < 18 || i + 2 > 22 || i + 2 == 20, "voxel {i}");
+    }
+}

@@ -1,0 +1,238 @@
+//! What a sweep accumulates. The driver hands every sink the answers of both senses for a piece of a row; sums are
+//! integers, so that order never matters.
+
+use super::lines::Family;
+use super::scan::Hit;
+use crate::grid::{Region, View};
+use crate::kernel::simd::Level;
+
+/// Constants of one family in one brick.
+pub(super) struct Visit<'a> {
+    pub family: &'a Family,
+    /// Natural axis of each frame axis.
+    pub perm: [usize; 3],
+    /// Planes looked at: the family's reach, or less where the brick is smaller. Answers equal to it mean "open".
+    pub reach: usize,
+    /// Contributions by answer, `reach + 1` per sense.
+    pub tables: [&'a [u32]; 2],
+    /// Displacement along the two other frame axes at each plane of the source, counted from `origin`.
+    pub shifts: [&'a [i32]; 2],
+    /// First global plane of the source.
+    pub origin: i64,
+}
+
+/// A piece of a row of the output tile.
+pub(super) struct Piece {
+    /// Global frame indices of its first voxel.
+    pub at: [i64; 3],
+    /// Frame axis along which lines run (0 or 1).
+    pub axis: usize,
+}
+
+/// Accumulates answers. `forward` and `backward` hold one answer per voxel of the piece; they are empty for a sense that
+/// is not swept.
+pub(super) trait Sink {
+    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]);
+}
+
+impl<A: Sink, B: Sink> Sink for (A, B) {
+    #[inline(always)]
+    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
+        self.0.add(visit, piece, forward, backward);
+        self.1.add(visit, piece, forward, backward);
+    }
+}
+
+/// Openness with weights that depend on the direction only. One buffer for each frame, each in the frame's order.
+pub(super) struct OpenSum<'a> {
+    pub level: Level,
+    pub sums: [&'a mut [u32]; 2],
+    /// The output tile, natural order.
+    pub tile: Region,
+}
+
+impl OpenSum<'_> {
+    pub fn clear(&mut self) {
+        self.sums.iter_mut().for_each(|s| s.fill(0));
+    }
+
+    /// Adds the sums of the exchanged frame to those in natural order.
+    pub fn merge(&mut self) {
+        const TILE: usize = 16;
+        let [nz, ny, nx] = self.tile.shape();
+        let [natural, turned] = &mut self.sums;
+        for y in 0..ny {
+            for z0 in (0..nz).step_by(TILE) {
+                for x0 in (0..nx).step_by(TILE) {
+                    for z in z0..nz.min(z0 + TILE) {
+                        let to = &mut natural[(z * ny + y) * nx..][..nx];
+                        for x in x0..nx.min(x0 + TILE) {
+                            to[x] += turned[(x * ny + y) * nz + z];
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// Openness of voxel `i` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes.
+    pub fn openness(&self, i: usize, total: u64) -> f32 {
+        (self.sums[0][i] as f64 / total as f64) as f32
+    }
+}
+
+impl Sink for OpenSum<'_> {
+    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
+        let [_, b, c] = visit.perm;
+        let n = self.tile.shape();
+        let at = |k: usize| (piece.at[k] - self.tile.lo[visit.perm[k]]) as usize;
+        let start = (at(0) * n[b] + at(1)) * n[c] + at(2);
+        let len = forward.len().max(backward.len());
+        let sums = &mut self.sums[usize::from(c == 0)][start..start + len];
+        add_contributions(self.level, sums, forward, backward, visit.tables);
+    }
+}
+
+crate::multiversion! {
+    fn add_contributions['a, H: Hit](
+        sums: &mut [u32], forward: &[H], backward: &[H], tables: [&'a [u32]; 2]
+    ) -> () = add_contributions_inner;
+}
+
+#[inline(always)]
+fn add_contributions_inner<H: Hit>(sums: &mut [u32], forward: &[H], backward: &[H], tables: [&[u32]; 2]) {
+    for (answers, table) in [(forward, tables[0]), (backward, tables[1])] {
+        for (sum, answer) in sums.iter_mut().zip(answers) {
+            *sum += table[answer.steps()];
+        }
+    }
+}
+
+/// Bits after the point of the sums of [`WeightedSum`].
+pub(super) const WIDE: f64 = (1u64 << 30) as f64;
+/// Colours beyond this are cut off, so that sums of thousands fit.
+const MAX_COLOUR: f64 = (1u64 << 18) as f64;
+
+/// Openness or colour with weights per voxel and direction. Sums are in the natural order of the tile.
+pub(super) struct WeightedSum<'a> {
+    /// The output tile, and the whole output box that `normal` covers.
+    pub tile: Region,
+    pub dst_box: Region,
+    pub src_box: Region,
+    /// Gradient on the output box; toward the solid, or away from it where `flipped`.
+    pub normal: Option<[View<'a, f32>; 3]>,
+    pub flipped: bool,
+    pub weights: &'a mut [i64],
+    /// Sums of openness.
+    pub open: &'a mut [i64],
+    /// Colour on the source box, if it is wanted.
+    pub colour: Option<[View<'a, f32>; 3]>,
+    /// Colour of the open.
+    pub ambient: [f64; 3],
+    /// Sums of colour.
+    pub rgb: [&'a mut [i64]; 3],
+}
+
+/// Components of a unit vector toward the open side; zero where the gradient vanishes or is not a number.
+#[inline(always)]
+fn normal_at(normal: &[View<f32>; 3], at: [usize; 3], flipped: bool) -> [f64; 3] {
+    let g = normal.map(|v| v.at(at) as f64);
+    let squares = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+    if !(squares > 0.0 && squares.is_finite()) {
+        return [0.0; 3];
+    }
+    let scale = if flipped { 1.0 } else { -1.0 } / squares.sqrt();
+    g.map(|c| c * scale)
+}
+
+impl WeightedSum<'_> {
+    pub fn clear(&mut self) {
+        self.weights.fill(0);
+        self.open.fill(0);
+        self.rgb.iter_mut().for_each(|s| s.fill(0));
+    }
+
+    /// Openness of voxel `i` of the tile.
+    pub fn openness(&self, i: usize) -> f32 {
+        if self.weights[i] == 0 { 1.0 } else { (self.open[i] as f64 / self.weights[i] as f64) as f32 }
+    }
+
+    /// Colour of voxel `i` of the tile.
+    pub fn colour_of(&self, i: usize) -> [f32; 3] {
+        let weight = self.weights[i] as f64;
+        std::array::from_fn(|c| match weight {
+            0.0 => self.ambient[c] as f32,
+            w => (self.rgb[c][i] as f64 / w) as f32,
+        })
+    }
+
+    /// One answer of one voxel: `p` is its global index in natural order.
+    #[inline(always)]
+    fn one(&mut self, visit: &Visit, way: usize, p: [i64; 3], normal: [f64; 3], steps: usize, axis: usize) {
+        let sense = visit.family.senses[way].as_ref().expect("answers come from senses that are swept");
+        let w = sense.direction;
+        let cosine = if normal == [0.0; 3] { 1.0 } else { normal[0] * w[0] + normal[1] * w[1] + normal[2] * w[2] };
+        if cosine <= 0.0 {
+            return;
+        }
+        let weight = sense.weight * cosine;
+        let open = steps == visit.reach;
+        let rho = if open { 1.0 } else { visit.family.rho[steps] };
+        let n = self.tile.shape();
+        let local: [usize; 3] = std::array::from_fn(|a| (p[a] - self.tile.lo[a]) as usize);
+        let i = (local[0] * n[1] + local[1]) * n[2] + local[2];
+        let fixed = |v: f64| (v * WIDE).round_ties_even() as i64;
+        self.weights[i] += fixed(weight);
+        self.open[i] += fixed(weight * rho);
+        let Some(colour) = &self.colour else { return };
+        let seen = if open {
+            self.ambient
+        } else {
+            let at = occluder(visit, way, p, steps, axis);
+            let at: [usize; 3] = std::array::from_fn(|a| (at[a] - self.src_box.lo[a]) as usize);
+            colour.map(|v| v.at(at) as f64)
+        };
+        for (sum, c) in self.rgb.iter_mut().zip(seen) {
+            // NaN as an integer is 0: a colour that is not there adds nothing.
+            sum[i] += fixed(weight * rho * c.clamp(-MAX_COLOUR, MAX_COLOUR));
+        }
+    }
+}
+
+/// Global index, natural order, of the voxel that occludes `p` after `steps` free planes.
+#[inline(always)]
+fn occluder(visit: &Visit, way: usize, p: [i64; 3], steps: usize, axis: usize) -> [i64; 3] {
+    let j = steps as i64 + 1;
+    let from = p[visit.perm[axis]];
+    let to = if way == 0 { from + j } else { from - j };
+    let shift = |s: usize| {
+        let at = |k: i64| visit.shifts[s][(k - visit.origin) as usize] as i64;
+        at(to) - at(from)
+    };
+    let mut q = p;
+    q[visit.perm[axis]] = to;
+    q[visit.perm[1 - axis]] += shift(0);
+    q[visit.perm[2]] += shift(1);
+    q
+}
+
+impl Sink for WeightedSum<'_> {
+    #[inline(always)]
+    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
+        for i in 0..forward.len().max(backward.len()) {
+            let mut p = [0; 3];
+            for k in 0..3 {
+                p[visit.perm[k]] = piece.at[k] + if k == 2 { i as i64 } else { 0 };
+            }
+            let normal = self.normal.as_ref().map_or([0.0; 3], |n| {
+                let at = std::array::from_fn(|a| (p[a] - self.dst_box.lo[a]) as usize);
+                normal_at(n, at, self.flipped)
+            });
+            for (way, answers) in [forward, backward].into_iter().enumerate() {
+                if let Some(answer) = answers.get(i) {
+                    self.one(visit, way, p, normal, answer.steps(), piece.axis);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,177 @@
+//! The brick's shape from the budget.
+
+use super::Plan;
+use super::memory::{self, brick_bytes, parked_bytes};
+use super::tasks::{Group, input_halo};
+use crate::config::Config;
+use crate::grid::Shape;
+use crate::{Error, Result};
+
+/// The brick and what it costs.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct BrickChoice {
+    pub shape: Shape,
+    /// Bytes that one brick keeps alive.
+    pub bytes: u64,
+    /// Bricks alive at once.
+    pub in_flight: usize,
+    /// Bytes for decoded chunks.
+    pub cache: u64,
+    /// Bytes of open chunks of the levels.
+    pub parked: u64,
+    /// Input voxels read per output voxel.
+    pub amplification: f64,
+    pub why: String,
+}
+
+impl BrickChoice {
+    /// Worst case by formula.
+    pub fn peak(&self, threads: usize) -> u64 {
+        memory::FIXED + memory::PER_THREAD * threads as u64 + self.parked + self.bytes * self.in_flight as u64 + self.cache
+    }
+}
+
+/// Chooses the brick of a group, or refuses with the least budget that would do.
+pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<BrickChoice> {
+    if let Some(asked) = config.run.brick {
+        let shape = round_up(asked.map(|n| n.max(1)), group.align, group.task);
+        let why = if shape == asked {
+            "as asked".to_string()
+        } else {
+            format!("asked for {asked:?}; bricks are multiples of {:?} and at most a task of {:?}", group.align, group.task)
+        };
+        return fit(plan, group, shape, why).ok_or_else(|| refuse(plan, group, shape, config));
+    }
+    let mut best: Option<(f64, BrickChoice)> = None;
+    for shape in candidates(group) {
+        let Some(choice) = fit(plan, group, shape, String::new()) else { continue };
+        let cost = cost(plan, group, shape, &choice);
+        if best.as_ref().is_none_or(|(c, _)| cost < *c) {
+            best = Some((cost, choice));
+        }
+    }
+    match best {
+        Some((_, mut choice)) => {
+            choice.why = format!(
+                "least work per voxel of the shapes whose {} bricks in flight fit: reads {:.2} input voxels per output voxel",
+                choice.in_flight, choice.amplification
+            );
+            Ok(choice)
+        }
+        None => Err(refuse(plan, group, least(group), config)),
+    }
+}
+
+/// The smallest brick: one chunk where that is small, else the alignment.
+fn least(group: &Group) -> Shape {
+    let shape = group.region.shape();
+    round_up(std::array::from_fn(|a| group.align[a].min(shape[a])), group.align, group.task)
+}
+
+fn round_up(asked: Shape, align: Shape, task: Shape) -> Shape {
+    std::array::from_fn(|a| (asked[a].div_ceil(align[a]) * align[a]).min(task[a]))
+}
+
+/// Multiples of whole chunks (powers of two of them), and of the alignment below a chunk.
+fn candidates(group: &Group) -> Vec<Shape> {
+    let shape = group.region.shape();
+    let axis = |a: usize| {
+        let unit = if group.chunk[a] % group.align[a] == 0 && group.chunk[a] > 1 { group.chunk[a] } else { group.align[a] };
+        let unit = if unit < 16 { unit * 16usize.div_ceil(unit) } else { unit };
+        let mut edges: Vec<usize> = Vec::new();
+        let mut edge = unit;
+        let end = group.task[a].min(shape[a].div_ceil(group.align[a]) * group.align[a]);
+        while edge < end {
+            edges.push(edge);
+            edge *= 2;
+        }
+        edges.push(end);
+        // Below a chunk: for budgets that one chunk's brick does not fit.
+        let mut small = unit / 2;
+        while small >= group.align[a].max(8) && unit > group.align[a] {
+            edges.push(small.div_ceil(group.align[a]) * group.align[a]);
+            small /= 2;
+        }
+        edges.sort_unstable();
+        edges.dedup();
+        edges
+    };
+    let (zs, ys, xs) = (axis(0), axis(1), axis(2));
+    let mut all = Vec::new();
+    for &z in &zs {
+        for &y in &ys {
+            all.extend(xs.iter().map(|&x| [z, y, x]));
+        }
+    }
+    all
+}
+
+/// Bytes of a shape, or `None` where not even one brick fits.
+fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickChoice> {
+    let bytes = brick_bytes(plan, group, shape);
+    let mut probe = group.clone();
+    probe.brick.shape = shape;
+    let parked = parked_bytes(plan, &probe);
+    let fixed = memory::FIXED + memory::PER_THREAD * plan.threads as u64;
+    let room = plan.memory.checked_sub(fixed + parked)?;
+    let in_flight = (room / bytes.max(1)).min(memory::in_flight(plan.threads) as u64) as usize;
+    if in_flight == 0 {
+        return None;
+    }
+    let cache = memory::cache_bytes(plan, bytes, in_flight as u64, parked);
+    Some(BrickChoice { shape, bytes, in_flight, cache, parked, amplification: amplification(plan, group, shape), why })
+}
+
+/// Input voxels read per output voxel, the mean over the group's inputs, halos clipped to the volume.
+fn amplification(plan: &Plan, group: &Group, shape: Shape) -> f64 {
+    let inputs = &group.inputs;
+    let one = |w: usize| {
+        let halo = input_halo(plan, group, w);
+        (0..3)
+            .map(|a| {
+                let b = shape[a].min(group.region.shape()[a]) as f64;
+                (b + 2.0 * halo[a] as f64).min(group.shape[a] as f64) / b
+            })
+            .product::<f64>()
+    };
+    inputs.iter().map(|&w| one(w)).sum::<f64>() / inputs.len().max(1) as f64
+}
+
+/// Relative time per voxel: work on halos, short rows, idle cores at the end, too few bricks in flight.
+fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
+    let region = group.region.shape();
+    let bricks = (0..3).map(|a| region[a].div_ceil(shape[a])).product::<usize>() as f64;
+    let threads = plan.threads as f64;
+    // One brick is one task on one thread: the last round leaves cores idle.
+    let rounds = (bricks / threads).ceil() * threads / bricks;
+    let short_rows = 1.0 + 24.0 / shape[2].min(region[2]) as f64;
+    let starved = if choice.in_flight > plan.threads { 1.0 } else { 1.5 + threads / choice.in_flight as f64 };
+    // Cells, chunks and cached pages stay warm in bricks of a few million voxels; beyond, the pipeline only gets coarser.
+    let large = 1.0 + (shape.iter().product::<usize>() as f64 / 16e6).powi(2) * 0.1;
+    let partial_chunks = if (0..3).any(|a| shape[a] % group.chunk[a] != 0 && shape[a] < region[a]) { 1.15 } else { 1.0 };
+    let overhead = 1.0 + 20_000.0 / shape.iter().product::<usize>() as f64;
+    choice.amplification.powf(0.8) * rounds * short_rows * starved * large * partial_chunks * overhead
+}
+
+fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
+    let bytes = brick_bytes(plan, group, shape);
+    let mut probe = group.clone();
+    probe.brick.shape = shape;
+    let need = bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.threads as u64;
+    Error::config(
+        "run.memory",
+        format!(
+            "{} is too little for one brick: the smallest, {shape:?} voxels (z, y, x), with its halo, results and scratch \
+             takes {}; give at least memory = \"{}MiB\"",
+            mib(plan.memory),
+            mib(bytes),
+            need.div_ceil(1 << 20)
+        ),
+    )
+    .located(&config.file, config.run.place.line)
+}
+
+/// A size for people.
+pub fn mib(bytes: u64) -> String {
+    if bytes >= 10 << 30 { format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64) } else { format!("{:.1} MiB", bytes as f64 / (1 << 20) as f64) }
+}

@@ -1,0 +1,190 @@
+//! The plan as text and JSON: what `occlude plan` prints.
+
+use std::fmt::Write;
+
+use serde_json::{Value, json};
+
+use super::brick::mib;
+use super::graph::{Producer, Step};
+use super::tasks::input_halo;
+use super::{Group, Plan};
+use crate::Result;
+use crate::config::Config;
+use crate::store::{Source, open_inputs};
+
+/// Opens the inputs' headers, plans, and describes the plan for people and for programs. Runs nothing.
+pub fn explain(config: &Config) -> Result<(String, Value)> {
+    let sources = open_inputs(config)?;
+    let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
+    let plan = Plan::new(config, &infos)?;
+    Ok((text(config, &plan, &sources), describe(config, &plan, &sources)))
+}
+
+fn text(config: &Config, plan: &Plan, sources: &[Source]) -> String {
+    let mut out = String::new();
+    let w = &mut out;
+    for (input, source) in config.inputs.iter().zip(sources) {
+        let info = source.info();
+        let unit = info.unit.as_deref().unwrap_or("unit unknown");
+        let _ = writeln!(
+            w,
+            "input {}: {:?} {} voxels (z, y, x), spacing {:?} {unit}, {}",
+            input.name, info.shape, info.dtype, info.spacing, info.format
+        );
+        if source.spool_bytes() > 0 {
+            let _ = writeln!(w, "  unpacked once to scratch: {}", mib(source.spool_bytes()));
+        }
+    }
+    for (s, step) in plan.graph.steps.iter().enumerate() {
+        let (_, device, reason) = &plan.placement[s];
+        let _ = writeln!(w, "step {s}: {} -> {} on {device} ({reason})", reads(plan, step), makes(plan, step));
+        let _ = writeln!(w, "  {}, reach {:?}, halo beyond the brick {:?}", step.kind.name(), step.reach, step.halo);
+        if step.stages.len() > 1 {
+            let _ = writeln!(w, "  one pass for {}", step.stages.join(", "));
+        }
+    }
+    for group in &plan.groups {
+        group_text(w, plan, group);
+    }
+    for output in &plan.outputs {
+        let spec = &output.spec;
+        let _ = writeln!(w, "output {}: {} as {}", spec.name, spec.path.display(), spec.dtype);
+        for (d, level) in spec.pyramid.levels.iter().enumerate() {
+            let _ = writeln!(w, "  level {d}: {:?} scale {:?} translation {:?}", level.shape, level.scale, level.translation);
+        }
+    }
+    for warning in &plan.warnings {
+        let _ = writeln!(w, "warning: {warning}");
+    }
+    out
+}
+
+fn group_text(w: &mut String, plan: &Plan, group: &Group) {
+    let brick = &group.brick;
+    let _ = writeln!(w, "brick {:?} voxels (z, y, x): {}", brick.shape, brick.why);
+    let _ = writeln!(
+        w,
+        "  {} bricks in {} tasks of up to {:?}; {} each, {} in flight",
+        group.brick_count(),
+        group.task_count(),
+        group.task,
+        mib(brick.bytes),
+        brick.in_flight
+    );
+    let _ = writeln!(
+        w,
+        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {})",
+        mib(brick.peak(plan.threads)),
+        mib(plan.memory),
+        mib(brick.bytes * brick.in_flight as u64),
+        mib(brick.cache),
+        mib(brick.parked)
+    );
+    let _ = writeln!(w, "  read amplification {:.2}", brick.amplification);
+    for &input in &group.inputs {
+        let _ = writeln!(w, "  halo of {}: {:?}", plan.graph.wires[input].name, input_halo(plan, group, input));
+    }
+}
+
+fn reads(plan: &Plan, step: &Step) -> String {
+    let mut names: Vec<&str> = step.inputs.iter().map(|&w| plan.graph.wires[w].name.as_str()).collect();
+    names.extend(step.mask.as_ref().map(|m| plan.graph.wires[m.wire].name.as_str()));
+    names.join(", ")
+}
+
+fn makes(plan: &Plan, step: &Step) -> String {
+    step.outputs.iter().map(|&w| plan.graph.wires[w].name.as_str()).collect::<Vec<_>>().join(", ")
+}
+
+/// Bytes of the inputs' voxels that the run reads at least once, and of level 0 and all levels written, uncompressed.
+fn traffic(plan: &Plan, sources: &[Source]) -> (u64, u64) {
+    let mut inputs: Vec<usize> = Vec::new();
+    for group in &plan.groups {
+        for &w in &group.inputs {
+            if let Producer::Input(i) = plan.graph.wires[w].producer
+                && !inputs.contains(&i)
+            {
+                inputs.push(i);
+            }
+        }
+    }
+    let size = |i: &usize| {
+        let info = sources[*i].info();
+        (info.voxels() * info.components * info.dtype.size()) as u64
+    };
+    let written = |spec: &crate::store::SinkSpec| {
+        let voxels: usize = spec.pyramid.levels.iter().map(|l| l.shape.iter().product::<usize>()).sum();
+        (voxels * spec.components.unwrap_or(1) * spec.dtype.size()) as u64
+    };
+    (inputs.iter().map(size).sum(), plan.outputs.iter().map(|o| written(&o.spec)).sum())
+}
+
+fn describe(config: &Config, plan: &Plan, sources: &[Source]) -> Value {
+    let (read, write) = traffic(plan, sources);
+    let inputs: Vec<Value> = config
+        .inputs
+        .iter()
+        .zip(sources)
+        .map(|(input, source)| {
+            let info = source.info();
+            json!({
+                "name": input.name, "shape": info.shape, "dtype": info.dtype.numpy_name(), "spacing": info.spacing,
+                "unit": info.unit, "origin": info.origin, "format": info.format, "scratch_bytes": source.spool_bytes(),
+            })
+        })
+        .collect();
+    let steps: Vec<Value> = plan
+        .graph
+        .steps
+        .iter()
+        .zip(&plan.placement)
+        .map(|(step, (_, device, reason))| {
+            json!({
+                "stages": step.stages, "kernel": step.kind.name(), "reads": reads(plan, step), "makes": makes(plan, step),
+                "reach": step.reach, "halo": step.halo, "device": device, "reason": reason,
+            })
+        })
+        .collect();
+    let groups: Vec<Value> = plan
+        .groups
+        .iter()
+        .map(|g| {
+            json!({
+                "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
+                "brick_bytes": g.brick.bytes, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
+                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache,
+                "peak_memory_bytes": g.brick.peak(plan.threads), "read_amplification": g.brick.amplification,
+            })
+        })
+        .collect();
+    let outputs: Vec<Value> = plan
+        .outputs
+        .iter()
+        .map(|o| {
+            let levels: Vec<Value> = o
+                .spec
+                .pyramid
+                .levels
+                .iter()
+                .map(|l| json!({ "shape": l.shape, "scale": l.scale, "translation": l.translation }))
+                .collect();
+            json!({ "name": o.spec.name, "path": o.spec.path, "dtype": o.spec.dtype.numpy_name(), "levels": levels,
+                    "chunk": o.spec.chunk, "shard": o.spec.shard, "fill": o.spec.fill.to_string() })
+        })
+        .collect();
+    json!({
+        "inputs": inputs,
+        "steps": steps,
+        "groups": groups,
+        "outputs": outputs,
+        "placement": plan.placement.iter().map(|(n, d, _)| (n.clone(), json!(d))).collect::<serde_json::Map<_, _>>(),
+        "peak_memory_bytes": plan.groups.iter().map(|g| g.brick.peak(plan.threads)).max(),
+        "memory_budget_bytes": plan.memory,
+        "scratch_bytes": sources.iter().map(Source::spool_bytes).sum::<u64>(),
+        "read_amplification": plan.groups.iter().map(|g| g.brick.amplification).fold(0.0, f64::max),
+        "bytes_to_read": read,
+        "bytes_to_write": write,
+        "tasks": plan.task_count(),
+        "warnings": plan.warnings,
+    })
+}

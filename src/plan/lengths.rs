@@ -1,0 +1,99 @@
+//! Lengths of the config to voxels, with the spacing that the input reports.
+
+use super::graph::Lattice;
+use crate::config::{Length, units};
+use crate::{Error, Result};
+
+/// Metres per unit of a lattice; an error says how to give the unit.
+fn lattice_unit(lattice: &Lattice, key: &str, given: &str) -> Result<f64> {
+    lattice.unit.as_deref().and_then(units::to_metres).ok_or_else(|| {
+        let has = lattice.unit.as_deref().unwrap_or("none");
+        Error::config(
+            key,
+            format!(
+                "the length \"{given}\" needs to know the unit of the spacing, and the input's unit is {has}; \
+                 give `unit = \"millimeter\"` (or another UDUNITS length) on the input, or a length in voxels"
+            ),
+        )
+    })
+}
+
+/// A physical length in units of the lattice's spacing.
+fn physical(value: f64, unit: &str, lattice: &Lattice, key: &str) -> Result<f64> {
+    let given = format!("{value} {unit}");
+    let metres = units::to_metres(unit).ok_or_else(|| {
+        Error::config(key, format!("\"{given}\" has an unknown unit; accepted: m, cm, mm, um, nm, angstrom and UDUNITS names"))
+    })?;
+    Ok(value * metres / lattice_unit(lattice, key, &given)?)
+}
+
+/// Half-widths in voxels. Physical: `round(R / spacing)` half away from zero, at least 1 on an axis longer than 1.
+pub fn radius(length: &Length, lattice: &Lattice, key: &str) -> Result<[usize; 3]> {
+    match length {
+        Length::Voxels(v) => Ok(v.map(|r| r as usize)),
+        Length::Physical { value, unit } => {
+            let r = physical(*value, unit, lattice, key)?;
+            Ok(std::array::from_fn(|a| {
+                let voxels = (r / lattice.spacing[a]).round();
+                (voxels.min(1e9) as usize).max(usize::from(lattice.shape[a] > 1))
+            }))
+        }
+    }
+}
+
+/// Real widths in voxels per axis.
+pub fn sigma(length: &Length, lattice: &Lattice, key: &str) -> Result<[f64; 3]> {
+    match length {
+        Length::Voxels(v) => Ok(*v),
+        Length::Physical { value, unit } => {
+            let s = physical(*value, unit, lattice, key)?;
+            Ok(lattice.spacing.map(|h| s / h))
+        }
+    }
+}
+
+/// One distance in voxels of the finest axis.
+pub fn distance(length: &Length, lattice: &Lattice, key: &str) -> Result<f64> {
+    match length {
+        Length::Voxels(v) => Ok(v[0]),
+        Length::Physical { value, unit } => {
+            let finest = lattice.spacing.into_iter().fold(f64::INFINITY, f64::min);
+            Ok(physical(*value, unit, lattice, key)? / finest)
+        }
+    }
+}
+
+/// Half-widths of the box of about the ball's volume: the odd side nearest to 0.806 (2r + 1), at least 3. An axis of
+/// radius 0 stays flat.
+pub fn equal_volume(radius: [usize; 3]) -> [usize; 3] {
+    radius.map(|r| {
+        if r == 0 {
+            return 0;
+        }
+        let side = 0.806 * (2 * r + 1) as f64;
+        (((side - 1.0) / 2.0).round() as usize).max(1)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lattice(spacing: [f64; 3], unit: Option<&str>) -> Lattice {
+        Lattice { input: 0, shape: [10, 10, 1], spacing, origin: [0.0; 3], unit: unit.map(str::to_string) }
+    }
+
+    #[test]
+    fn physical_radii_round_half_away_and_never_vanish_on_long_axes() {
+        let r = Length::Physical { value: 2.5, unit: "mm".into() };
+        assert_eq!(radius(&r, &lattice([1.0, 10.0, 10.0], Some("millimeter")), "k").unwrap(), [3, 1, 0]);
+        assert_eq!(radius(&r, &lattice([1000.0, 500.0, 1.0], Some("micrometer")), "k").unwrap(), [3, 5, 2500]);
+        assert!(radius(&r, &lattice([1.0; 3], None), "k").is_err());
+    }
+
+    #[test]
+    fn equal_volume_sides_are_odd_and_near() {
+        assert_eq!(equal_volume([10, 5, 1]), [8, 4, 1]); // 16.9 -> 17, 8.9 -> 9, 2.4 -> 3
+        assert_eq!(equal_volume([0, 2, 3]), [0, 2, 2]); // 4.03 -> 5 (nearest odd of 3 and 5), 5.64 -> 5
+    }
+}

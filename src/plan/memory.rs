@@ -1,0 +1,152 @@
+//! Bytes by formula: what one brick of a given shape keeps alive at its worst moment, and what the run keeps besides.
+
+use super::graph::{Step, StepKind, WireId};
+use super::tasks::{Group, input_halo};
+use super::{OutputPlan, Plan};
+use crate::grid::{Border, DType, Region, Shape};
+use crate::kernel::{gaussian, gradient, obscurance, rank, reduce, window};
+
+/// What the program itself, thread stacks and the allocator's slack take of the ceiling.
+pub const FIXED: u64 = 16 << 20;
+/// Codec contexts and the chunk being encoded or decoded, per thread.
+pub const PER_THREAD: u64 = 4 << 20;
+
+/// The box of a wire that a brick needs: grown by the halo, clipped to the volume.
+pub fn wire_box(brick: Region, halo: [usize; 3], volume: Shape) -> Region {
+    brick.grow(halo).clip(&Region::whole(volume))
+}
+
+/// Bytes that one brick of `shape` voxels keeps alive at most, from its first read to its last write.
+pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
+    let size = |halo: [usize; 3]| grown(shape, halo, group.shape);
+    let voxels = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
+    let wire_bytes = |w: WireId, halo: [usize; 3]| {
+        let wire = &plan.graph.wires[w];
+        voxels(size(halo)) * (wire.components * wire.dtype.size()) as u64
+    };
+    let mut live: Vec<(WireId, u64)> =
+        group.inputs.iter().map(|&w| (w, wire_bytes(w, input_halo(plan, group, w)))).collect();
+    let mut peak = sum(&live);
+    for (at, &s) in group.steps.iter().enumerate() {
+        let step = &plan.graph.steps[s];
+        let outputs: Vec<(WireId, u64)> = step.outputs.iter().map(|&w| (w, wire_bytes(w, step.halo))).collect();
+        let now = sum(&live) + sum(&outputs) + step_scratch(plan, step, shape, group.shape);
+        peak = peak.max(now);
+        live.extend(outputs);
+        let last_use = |w: WireId| {
+            group.sinks.contains(&w) || group.steps[at + 1..].iter().any(|&t| reads(&plan.graph.steps[t], w))
+        };
+        let is_map = |w: WireId| group.outputs.iter().any(|&o| plan.outputs[o].map.as_ref().is_some_and(|m| m.source == w));
+        live.retain(|(w, _)| last_use(*w) || is_map(*w));
+    }
+    let sinks: u64 = group.outputs.iter().map(|&o| output_bytes(plan, group, &plan.outputs[o], shape)).sum();
+    peak.max(sum(&live) + sinks)
+}
+
+fn sum(list: &[(WireId, u64)]) -> u64 {
+    list.iter().map(|e| e.1).sum()
+}
+
+fn reads(step: &Step, wire: WireId) -> bool {
+    step.inputs.contains(&wire) || step.mask.as_ref().is_some_and(|m| m.wire == wire)
+}
+
+/// A brick grown by a halo, at most the volume.
+fn grown(shape: Shape, halo: [usize; 3], volume: Shape) -> Shape {
+    std::array::from_fn(|a| (shape[a] + 2 * halo[a]).min(volume[a]))
+}
+
+/// Kernel scratch, border copies and masks of one step.
+fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
+    let dst = grown(brick, step.halo, volume);
+    let wire = &plan.graph.wires[step.inputs[0]];
+    let padded: Shape = std::array::from_fn(|a| dst[a] + 2 * step.reach[a]);
+    let (src, copy) = match step.border {
+        Border::Clip => (std::array::from_fn(|a| padded[a].min(volume[a])), 0),
+        _ => (padded, padded.iter().product::<usize>() * window_dtype(wire.dtype, step.border).size()),
+    };
+    let dtype = window_dtype(wire.dtype, step.border);
+    let kernel = match &step.kind {
+        StepKind::Window { params, channels } => window::scratch_bytes(dtype, src, dst, params, channels),
+        StepKind::Rank { params, shape, .. } => rank::scratch_bytes(dtype, src, dst, params, *shape),
+        StepKind::Gaussian { sigma, channels } => gaussian::scratch_bytes(dtype, src, dst, *sigma, channels.len() > 1),
+        StepKind::Gradient { size, .. } => gradient::scratch_bytes(dtype, src, dst, *size),
+        StepKind::Obscurance { params, colour, normal, .. } => obscurance::Prepared::new(params).scratch_bytes(
+            dtype,
+            src,
+            dst,
+            colour.is_some(),
+            normal.is_some(),
+        ),
+        _ => 0,
+    };
+    let mask = if step.mask.is_some() { dst.iter().product() } else { 0 };
+    (kernel + copy + mask) as u64
+}
+
+/// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.
+fn window_dtype(dtype: DType, border: Border) -> DType {
+    match border {
+        Border::Constant(_) => dtype.result(),
+        _ => dtype,
+    }
+}
+
+/// Converted voxels, cells of the levels and encoded chunks of one output.
+fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -> u64 {
+    let voxels = brick.iter().map(|&n| n as u64).product::<u64>();
+    let parts = output.spec.components.unwrap_or(1) as u64;
+    let written = voxels * output.spec.dtype.size() as u64;
+    // Encoded bytes may exceed the voxels a little; converted voxels are one component at a time.
+    let encoded = parts * (written + written / 8);
+    let level_1 = if output.level_count() > 1 { voxels / 8 } else { 0 };
+    let cells = 2 * level_1 * reduce::bytes_per_cell(output.reduce) as u64;
+    let map = match &output.map {
+        // Mean and variance of the grown brick, of the level below and of the passes between.
+        Some(m) => {
+            let halo = input_halo(plan, group, m.source);
+            grown(brick, halo, group.shape).iter().map(|&n| n as u64).product::<u64>() * 16 * 3
+        }
+        None => 0,
+    };
+    written + encoded + cells + map
+}
+
+/// Open chunks of the levels between their first and last brick, for one task, all outputs.
+pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
+    let mut total = 0;
+    for &o in &group.outputs {
+        let output = &plan.outputs[o];
+        if !output.is_zarr() {
+            continue;
+        }
+        let parts = output.spec.components.unwrap_or(1) as u64;
+        let voxel = output.spec.dtype.size() as u64;
+        let task: u64 = (0..3).map(|a| group.task[a].min(group.region.shape()[a]) as u64).product();
+        for k in 0..=output.brick_level() {
+            let factor: u64 = output.level(k).expect("level exists").factor.iter().map(|&f| f as u64).product();
+            let level = task / factor * voxel * parts;
+            // Along the Morton curve, at most the chunks along a brick's longest row wait at once, and about as many again.
+            let chunk = output.spec.chunk.iter().map(|&n| n as u64).product::<u64>() * voxel * parts;
+            let row = group.brick.shape[2].div_ceil(output.spec.chunk[2]) as u64;
+            let whole = k == 0 && (0..3).all(|a| group.brick.shape[a] % output.spec.chunk[a] == 0);
+            total += if whole { 0 } else { level.min(chunk * 8 * row.max(1)) };
+        }
+        // Cells kept for the second phase.
+        let deepest = output.level(output.brick_level()).expect("level exists").factor;
+        let cells = task / deepest.iter().map(|&f| f as u64).product::<u64>();
+        total += cells * parts * reduce::bytes_per_cell(output.reduce) as u64;
+    }
+    total
+}
+
+/// Bricks that are alive at once: one per worker, one being read, one being written.
+pub fn in_flight(threads: usize) -> usize {
+    threads + 2
+}
+
+/// Bytes for decoded chunks when `bricks` bricks of `brick` bytes are alive.
+pub fn cache_bytes(plan: &Plan, brick: u64, bricks: u64, parked: u64) -> u64 {
+    let fixed = FIXED + PER_THREAD * plan.threads as u64;
+    plan.memory.saturating_sub(fixed + parked + brick * bricks)
+}

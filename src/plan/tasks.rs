@@ -1,0 +1,261 @@
+//! Volumes cut into super-blocks (tasks) and bricks.
+//!
+//! A task owns whole shards of level 0 and of as many further levels as fit in about [`TASK_EDGE`] voxels per axis. It
+//! depends on shapes, chunks and shards only, never on bricks, threads or budget, so that a resumed run may change those.
+
+use super::graph::{StepId, WireId, max3};
+use super::{BrickChoice, OutputPlan, Plan};
+use crate::Result;
+use crate::config::{Config, OutputFormat};
+use crate::grid::{Region, Shape};
+use crate::store::LevelLayout;
+
+/// Edge of a task that is aimed at: 512^3 u8 voxels take seconds, so a kill loses little and a marker costs little.
+const TASK_EDGE: usize = 512;
+/// Levels that every brick makes by itself: bricks are multiples of 2^3 on halved axes. Coarser levels are made in the
+/// second phase from cells of this level, 1/512 of the voxels.
+const BRICK_LEVELS: usize = 3;
+
+/// Outputs on one lattice shape, computed brick by brick together.
+#[derive(Debug, Clone)]
+pub struct Group {
+    pub shape: Shape,
+    /// The part of the volume that is computed.
+    pub region: Region,
+    /// Indices into [`Plan::outputs`].
+    pub outputs: Vec<usize>,
+    /// Wires whose values bricks deliver (outputs and the means beside them).
+    pub sinks: Vec<WireId>,
+    pub steps: Vec<StepId>,
+    /// Input wires that the steps and outputs read.
+    pub inputs: Vec<WireId>,
+    /// Bricks are multiples of this, so that no cell of a brick-made level straddles two.
+    pub align: Shape,
+    /// Bricks that are multiples of this complete whole chunks.
+    pub chunk: Shape,
+    /// Voxels of a task, anchored at the region's start; a multiple of `align`.
+    pub task: Shape,
+    /// Tasks per axis.
+    pub tasks: Shape,
+    /// Number of the group's first task.
+    pub first_task: usize,
+    pub brick: BrickChoice,
+}
+
+/// One super-block.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Task {
+    pub group: usize,
+    /// Voxels of the input volume.
+    pub region: Region,
+}
+
+impl Group {
+    pub fn task_count(&self) -> usize {
+        self.tasks.iter().product()
+    }
+
+    /// The box of the group's `i`th task (C order over the task grid).
+    pub fn task_region(&self, i: usize) -> Region {
+        let [_, ny, nx] = self.tasks;
+        let cell = [i / (ny * nx), i / nx % ny, i % nx].map(|v| v as i64);
+        Region::of_cell(cell, self.region.lo, self.task).clip(&self.region)
+    }
+
+    /// Bricks of a task along a Morton curve.
+    pub fn bricks(&self, task: Region) -> Vec<Region> {
+        let mut cells: Vec<[i64; 3]> = task.cells(task.lo, self.brick.shape).iter().collect();
+        cells.sort_by_key(|c| crate::grid::order::morton(*c));
+        cells.into_iter().map(|c| Region::of_cell(c, task.lo, self.brick.shape).clip(&task)).collect()
+    }
+
+    /// Bricks of the whole group.
+    pub fn brick_count(&self) -> usize {
+        (0..self.task_count())
+            .map(|t| {
+                let shape = self.task_region(t).shape();
+                (0..3).map(|a| shape[a].div_ceil(self.brick.shape[a])).product::<usize>()
+            })
+            .sum()
+    }
+}
+
+impl OutputPlan {
+    /// Layout of level `k` of the full-resolution chain (an occlusion map's datasets start later).
+    pub fn level(&self, k: usize) -> Option<&LevelLayout> {
+        match &self.map {
+            Some(map) => map.chain.levels.get(k),
+            None => self.spec.pyramid.levels.get(k),
+        }
+    }
+
+    /// Levels of the chain, level 0 counted.
+    pub fn level_count(&self) -> usize {
+        self.map.as_ref().map_or(self.spec.pyramid.levels.len(), |m| m.chain.levels.len())
+    }
+
+    /// First level of the chain that is stored.
+    pub fn first_level(&self) -> usize {
+        self.map.as_ref().map_or(0, |m| m.first)
+    }
+
+    pub fn is_zarr(&self) -> bool {
+        matches!(self.spec.format, OutputFormat::OmeZarr04 | OutputFormat::OmeZarr05)
+    }
+
+    /// The last level that bricks make by themselves.
+    pub fn brick_level(&self) -> usize {
+        (self.level_count() - 1).min(BRICK_LEVELS)
+    }
+
+    /// Edges of the files that are committed whole: shards, or chunks without them.
+    pub fn commit_shape(&self) -> Shape {
+        match self.spec.format {
+            OutputFormat::OmeZarr05 => self.spec.shard.unwrap_or(self.spec.chunk),
+            _ => self.spec.chunk,
+        }
+    }
+
+    /// Whether every file of level `k` belongs to one task of these edges.
+    pub fn owned(&self, k: usize, group: &Group) -> bool {
+        if !self.is_zarr() {
+            return k == 0;
+        }
+        let (Some(level), file, shape) = (self.level(k), self.commit_shape(), group.region.shape()) else { return false };
+        k <= self.brick_level()
+            && (0..3).all(|a| group.task[a] >= shape[a] || group.task[a] % (file[a] * level.factor[a]) == 0)
+    }
+
+    /// The box of level `k` (in its own cells, counted from the output's start) that a box of voxels makes.
+    pub fn level_box(&self, k: usize, voxels: Region) -> Region {
+        let level = self.level(k).expect("a level of the chain");
+        let at = |v: i64, a: usize| (v - self.region.lo[a]).div_euclid(level.factor[a] as i64);
+        let up = |v: i64, a: usize| (v - self.region.lo[a] + level.factor[a] as i64 - 1).div_euclid(level.factor[a] as i64);
+        Region::new(
+            std::array::from_fn(|a| at(voxels.lo[a], a)),
+            std::array::from_fn(|a| up(voxels.hi[a], a).min(level.shape[a] as i64)),
+        )
+    }
+}
+
+/// Groups outputs by shape and cuts each group into tasks.
+pub fn groups(plan: &Plan, config: &Config) -> Result<Vec<Group>> {
+    let mut groups: Vec<Group> = Vec::new();
+    for (o, output) in plan.outputs.iter().enumerate() {
+        let shape = plan.graph.lattices[output.lattice].shape;
+        let at = groups.iter().position(|g| g.shape == shape).unwrap_or_else(|| {
+            groups.push(Group {
+                shape,
+                region: output.region,
+                outputs: vec![],
+                sinks: vec![],
+                steps: vec![],
+                inputs: vec![],
+                align: [1; 3],
+                chunk: [1; 3],
+                task: [1; 3],
+                tasks: [1; 3],
+                first_task: 0,
+                brick: BrickChoice::default(),
+            });
+            groups.len() - 1
+        });
+        groups[at].outputs.push(o);
+    }
+    let _ = config;
+    let mut first_task = 0;
+    for group in &mut groups {
+        fill_group(plan, group);
+        group.first_task = first_task;
+        first_task += group.task_count();
+    }
+    Ok(groups)
+}
+
+fn fill_group(plan: &Plan, group: &mut Group) {
+    let outputs: Vec<&OutputPlan> = group.outputs.iter().map(|&o| &plan.outputs[o]).collect();
+    for output in &outputs {
+        let pooled = output.means.iter().flatten().copied().filter(|_| output.reduce == crate::stage::Reduce::Moments);
+        for w in output.parts.iter().map(|p| p.0).chain(pooled) {
+            if !group.sinks.contains(&w) {
+                group.sinks.push(w);
+            }
+        }
+    }
+    group.steps = plan.steps_for(&group.sinks);
+    group.inputs = inputs_of(plan, &group.steps, &group.sinks);
+    for map in outputs.iter().filter_map(|o| o.map.as_ref()) {
+        if !group.inputs.contains(&map.source) {
+            group.inputs.push(map.source);
+        }
+    }
+    group.align = [1; 3];
+    group.chunk = [1; 3];
+    let mut files = [1; 3];
+    for output in &outputs {
+        let deepest = output.level(output.brick_level()).expect("level exists").factor;
+        group.align = lcm3(group.align, deepest);
+        if output.is_zarr() {
+            let first = output.level(output.first_level()).expect("level exists").factor;
+            let scaled = |edge: Shape| std::array::from_fn(|a| edge[a] * first[a]);
+            group.chunk = lcm3(group.chunk, scaled(output.spec.chunk));
+            files = lcm3(files, scaled(output.commit_shape()));
+        }
+    }
+    let base = lcm3(files, group.align);
+    group.task = task_shape(&outputs, base);
+    let shape = group.region.shape();
+    group.tasks = std::array::from_fn(|a| shape[a].div_ceil(group.task[a]).max(1));
+}
+
+/// Grows a task from the files of level 0 to those of further levels while it stays near [`TASK_EDGE`].
+fn task_shape(outputs: &[&OutputPlan], base: Shape) -> Shape {
+    let mut task = base;
+    for k in 1..=BRICK_LEVELS {
+        let mut next = task;
+        for output in outputs.iter().filter(|o| o.is_zarr() && k <= o.brick_level()) {
+            let factor = output.level(k).expect("level exists").factor;
+            let file = output.commit_shape();
+            next = lcm3(next, std::array::from_fn(|a| file[a] * factor[a]));
+        }
+        if (0..3).any(|a| next[a] > TASK_EDGE.max(base[a])) {
+            break;
+        }
+        task = next;
+    }
+    // Flat files and small chunks: as many as come near the edge.
+    std::array::from_fn(|a| task[a] * (TASK_EDGE / task[a]).max(1))
+}
+
+/// Input wires that steps and sinks read.
+pub fn inputs_of(plan: &Plan, steps: &[StepId], sinks: &[WireId]) -> Vec<WireId> {
+    let mut inputs = Vec::new();
+    let masks = steps.iter().filter_map(|&s| plan.graph.steps[s].mask.as_ref().map(|m| &m.wire));
+    let read = steps.iter().flat_map(|&s| &plan.graph.steps[s].inputs).chain(masks).chain(sinks);
+    for &w in read {
+        if matches!(plan.graph.wires[w].producer, super::graph::Producer::Input(_)) && !inputs.contains(&w) {
+            inputs.push(w);
+        }
+    }
+    inputs
+}
+
+/// Halo of a wire inside a group, with what its occlusion maps need of their source.
+pub fn input_halo(plan: &Plan, group: &Group, wire: WireId) -> [usize; 3] {
+    let mut halo = plan.graph.wires[wire].halo;
+    for &o in &group.outputs {
+        let output = &plan.outputs[o];
+        if let Some(map) = output.map.as_ref().filter(|m| m.source == wire) {
+            let deepest = map.chain.levels[output.brick_level()].factor;
+            halo = max3(halo, deepest.map(|f| 2 * (f - 1)));
+        }
+    }
+    halo
+}
+
+fn lcm3(a: Shape, b: Shape) -> Shape {
+    fn gcd(a: usize, b: usize) -> usize {
+        if b == 0 { a } else { gcd(b, a % b) }
+    }
+    std::array::from_fn(|i| (a[i] / gcd(a[i], b[i])).saturating_mul(b[i]))
+}

@@ -1,0 +1,322 @@
+//! From a finished brick to encoded chunks: conversion, levels while the voxels are hot, and chunks that wait for their
+//! last part.
+
+use std::collections::HashMap;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::compute::Finished;
+use super::maps;
+use super::steps::MaskValue;
+use super::value::{Comp, Value};
+use crate::Result;
+use crate::brick::{Pool, Scratch, Voxels, gather};
+use crate::grid::{AnyView, DType, Region, View};
+use crate::kernel::convert::{Mapping, convert_at};
+use crate::kernel::reduce::{Cells, Level0, planes};
+use crate::kernel::simd::Level;
+use crate::kernel::{Context, pointwise};
+use crate::plan::graph::{Producer, WireId};
+use crate::plan::{Group, OutputPlan, Plan};
+use crate::store::sink::Encoded;
+use crate::store::{Sink, Spill};
+
+/// One encoded chunk on its way to a writer.
+#[derive(Debug)]
+pub struct Item {
+    /// Index into the plan's outputs.
+    pub output: usize,
+    pub dataset: usize,
+    pub component: usize,
+    pub region: Region,
+    pub chunk: Encoded,
+}
+
+/// An output being assembled.
+#[derive(Debug)]
+pub struct Target {
+    pub sink: Sink,
+    /// By level of the chain: rounded voxels of levels whose files several tasks share.
+    pub levels: Vec<Option<Spill>>,
+    /// Unrounded cells of the last level that bricks make, for the levels beyond.
+    pub cells: Option<Spill>,
+    /// Values that map to 0 and the largest code.
+    pub range: Option<[f64; 2]>,
+}
+
+/// A task in progress.
+#[derive(Debug)]
+pub struct TaskSlot {
+    /// Number over all groups.
+    pub number: usize,
+    pub region: Region,
+    /// Bricks not yet written.
+    pub left: AtomicUsize,
+    open: Mutex<HashMap<ChunkKey, Open>>,
+}
+
+/// Output, level, component, chunk index.
+type ChunkKey = (usize, usize, usize, [i64; 3]);
+
+/// A chunk that waits for its last part.
+#[derive(Debug)]
+struct Open {
+    voxels: Voxels,
+    region: Region,
+    left: usize,
+}
+
+impl TaskSlot {
+    pub fn new(number: usize, region: Region, bricks: usize) -> TaskSlot {
+        TaskSlot { number, region, left: AtomicUsize::new(bricks), open: Mutex::default() }
+    }
+
+    /// Counts one written brick; true for the last.
+    pub fn written(&self) -> bool {
+        self.left.fetch_sub(1, Ordering::AcqRel) == 1
+    }
+}
+
+/// Assembles the bricks of one group.
+pub struct Assembler<'a> {
+    pub plan: &'a Plan,
+    pub group: &'a Group,
+    /// By output of the plan; `None` for outputs that are finished already.
+    pub targets: &'a [Option<Target>],
+    pub pool: &'a Pool,
+    pub level: Level,
+}
+
+/// Where the parts of one component go.
+pub struct Place<'a> {
+    pub index: usize,
+    pub output: &'a OutputPlan,
+    pub target: &'a Target,
+    pub component: usize,
+    pub slot: &'a TaskSlot,
+}
+
+impl Assembler<'_> {
+    /// Encoded chunks that this brick completes, over all outputs and levels.
+    pub fn assemble(&self, done: &Finished, slot: &TaskSlot, scratch: &mut Scratch) -> Result<Vec<Item>> {
+        let mut items = Vec::new();
+        for &index in &self.group.outputs {
+            let (output, Some(target)) = (&self.plan.outputs[index], &self.targets[index]) else { continue };
+            if output.map.is_some() {
+                maps::assemble(self, index, output, target, done, slot, scratch, &mut items)?;
+                continue;
+            }
+            for (component, &(wire, comp)) in output.parts.iter().enumerate() {
+                let place = Place { index, output, target, component, slot };
+                self.component(&place, wire, comp, done, scratch, &mut items)?;
+            }
+        }
+        Ok(items)
+    }
+
+    fn component(
+        &self,
+        place: &Place,
+        wire: WireId,
+        comp: usize,
+        done: &Finished,
+        scratch: &mut Scratch,
+        items: &mut Vec<Item>,
+    ) -> Result<()> {
+        let value = self.scaled(wire, comp, done);
+        let view = value.view();
+        self.store_level(place, 0, done.brick, view, items)?;
+        if place.output.level_count() > 1 {
+            let mean = match place.output.means.get(place.component) {
+                Some(&Some(mean)) if place.output.reduce == crate::stage::Reduce::Moments => {
+                    Some(self.scaled(mean, comp, done))
+                }
+                _ => None,
+            };
+            let needed = self.needed(wire, done);
+            let src = Level0 {
+                value: view,
+                mean: mean.as_ref().map(|m| m.view()),
+                needed: needed.as_ref().map(|m| View::dense(m, done.brick.shape())),
+            };
+            self.levels(place, src, done.brick, scratch, items)?;
+            mean.into_iter().for_each(|m| m.recycle(self.pool));
+        }
+        value.recycle(self.pool);
+        Ok(())
+    }
+
+    /// Levels 1 to the last that bricks make; cells of that one are kept for the levels beyond.
+    fn levels(&self, place: &Place, src: Level0, brick: Region, scratch: &mut Scratch, items: &mut Vec<Item>) -> Result<()> {
+        let output = place.output;
+        let mut cx = Context { level: self.level, scratch };
+        let (mut cells, mut fine) = (Cells::default(), Cells::default());
+        for k in 1..=output.brick_level() {
+            let halved = output.level(k).expect("level exists").halved;
+            if k == 1 {
+                cells.first(output.reduce, output.is_std, src, halved, &mut cx);
+            } else {
+                std::mem::swap(&mut cells, &mut fine);
+                cells.next_from(&fine, halved, &mut cx);
+            }
+            let mut rounded = self.pool.take(output.spec.dtype, cells.shape.iter().product());
+            cells.write([0; 3], self.mapping(place), rounded.view_mut(cells.shape), &mut cx);
+            self.put(place, k, output.level_box(k, brick), rounded.view(cells.shape), items)?;
+            self.pool.put(rounded);
+        }
+        if let Some(spill) = &place.target.cells {
+            let k = output.brick_level();
+            let region = output.level_box(k, brick);
+            if k == 0 {
+                unreachable!("a second phase needs at least one level made by bricks");
+            }
+            let mut data = Vec::new();
+            cells.store(&mut data);
+            let n = cells.value.len();
+            for (p, plane) in data.chunks_exact(n).enumerate() {
+                spill.write(place.component * planes(output.reduce) + p, region, as_bytes(plane));
+            }
+        }
+        Ok(())
+    }
+
+    pub fn mapping(&self, place: &Place) -> Mapping {
+        Mapping { range: place.target.range, fill: place.output.spec.fill }
+    }
+
+    /// Converts unrounded values to the output's type and puts them.
+    pub fn store_level(&self, place: &Place, k: usize, brick: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+        let region = place.output.level_box(k, brick);
+        self.store_box(place, k, region, view, items)
+    }
+
+    /// As [`Self::store_level`], for a box of the level's own cells.
+    pub fn store_box(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+        let spec = &place.output.spec;
+        if view.dtype() == spec.dtype && place.target.range.is_none() {
+            return self.put(place, k, region, view, items);
+        }
+        let mut converted = self.pool.take(spec.dtype, region.voxels());
+        convert_at(self.level, view, self.mapping(place), converted.view_mut(region.shape()));
+        let result = self.put(place, k, region, converted.view(region.shape()), items);
+        self.pool.put(converted);
+        result
+    }
+
+    /// Hands voxels of the output's type to their chunks: whole ones are encoded at once, parts wait for the rest.
+    fn put(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+        let (output, sink) = (place.output, &place.target.sink);
+        let dataset = k - output.first_level();
+        let mut push = |region: Region, chunk: Encoded| {
+            items.push(Item { output: place.index, dataset, component: place.component, region, chunk });
+        };
+        if !output.is_zarr() {
+            push(region, sink.encode(dataset, region, view)?);
+            return Ok(());
+        }
+        if let Some(spill) = &place.target.levels[k] {
+            let mut dense = self.pool.take(view.dtype(), region.voxels());
+            gather::copy_common(view, region, dense.view_mut(region.shape()), region);
+            spill.write(place.component, region, dense.as_bytes());
+            self.pool.put(dense);
+            return Ok(());
+        }
+        let whole = Region::whole(output.level(k).expect("level exists").shape);
+        for index in region.cells([0; 3], output.spec.chunk).iter() {
+            let chunk = Region::of_cell(index, [0; 3], output.spec.chunk).clip(&whole);
+            if region.contains(&chunk) {
+                push(chunk, sink.encode(dataset, chunk, view.part(region.offset_of(&chunk), chunk.shape()))?);
+            } else if let Some(full) = self.park(place, (place.index, k, place.component, index), chunk, region, view) {
+                push(chunk, sink.encode(dataset, chunk, full.view(chunk.shape()))?);
+                self.pool.put(full);
+            }
+        }
+        Ok(())
+    }
+
+    /// Adds a part to an open chunk; returns it when that was the last.
+    fn park(&self, place: &Place, key: ChunkKey, chunk: Region, region: Region, view: AnyView) -> Option<Voxels> {
+        let mut open = place.slot.open.lock().unwrap_or_else(|e| e.into_inner());
+        let entry = open.entry(key).or_insert_with(|| Open {
+            voxels: self.pool.take(view.dtype(), chunk.voxels()),
+            region: chunk,
+            left: chunk.voxels(),
+        });
+        gather::copy_common(view, region, entry.voxels.view_mut(entry.region.shape()), entry.region);
+        entry.left -= region.clip(&chunk).voxels();
+        if entry.left > 0 {
+            return None;
+        }
+        open.remove(&key).map(|o| o.voxels)
+    }
+
+    /// A wire's component over the brick: stored values where they are the values, else scaled, missing voxels NaN.
+    fn scaled<'d>(&self, wire: WireId, comp: usize, done: &'d Finished) -> Scaled<'d> {
+        let value = done.value(wire);
+        let wire = &self.plan.graph.wires[wire];
+        let len = done.brick.voxels();
+        if let Comp::Const(v) = value.comps[comp] {
+            let missing = wire.missing == Some(v as i64) && wire.missing.is_some();
+            let (dtype, v) = match wire.scaled_dtype() {
+                d if d == wire.dtype && wire.affine.is_identity() => (d, if missing { f64::NAN } else { v }),
+                d => (d, if missing { f64::NAN } else { wire.affine.apply(v) }),
+            };
+            let mut buffer = self.pool.take(dtype, len);
+            buffer.fill(v);
+            return Scaled::Owned(buffer, done.brick);
+        }
+        if wire.scaled_dtype() == wire.dtype && wire.affine.is_identity() {
+            return Scaled::Borrowed(value, comp, done.brick);
+        }
+        let mut buffer = self.pool.take(wire.scaled_dtype(), len);
+        pointwise::scale(value.view(comp, done.brick), wire.affine, wire.missing, buffer.view_mut(done.brick.shape()));
+        Scaled::Owned(buffer, done.brick)
+    }
+
+    /// The brick's part of the mask of the stage that made a wire; `None` = every voxel is needed.
+    fn needed(&self, wire: WireId, done: &Finished) -> Option<Vec<u8>> {
+        let Producer::Step(step) = self.plan.graph.wires[wire].producer else { return None };
+        match done.mask(step)? {
+            MaskValue::All => None,
+            MaskValue::None => Some(vec![0; done.brick.voxels()]),
+            MaskValue::Some(mask) => {
+                let region = done.value(wire).region;
+                let mut part = vec![0; done.brick.voxels()];
+                let dst = crate::grid::ViewMut::dense(&mut part, done.brick.shape());
+                gather::copy(View::dense(mask, region.shape()), region, dst, done.brick);
+                Some(part)
+            }
+        }
+    }
+}
+
+enum Scaled<'a> {
+    Borrowed(&'a Value, usize, Region),
+    Owned(Voxels, Region),
+}
+
+impl Scaled<'_> {
+    fn view(&self) -> AnyView<'_> {
+        match self {
+            Scaled::Borrowed(value, comp, region) => value.view(*comp, *region),
+            Scaled::Owned(voxels, region) => voxels.view(region.shape()),
+        }
+    }
+
+    fn recycle(self, pool: &Pool) {
+        if let Scaled::Owned(voxels, _) = self {
+            pool.put(voxels);
+        }
+    }
+}
+
+/// Numbers as bytes in this machine's order.
+pub fn as_bytes(numbers: &[f64]) -> &[u8] {
+    // SAFETY: f64 has no padding.
+    unsafe { std::slice::from_raw_parts(numbers.as_ptr().cast(), size_of_val(numbers)) }
+}
+
+/// Bytes of the output's type per voxel, for spills.
+pub fn item_size(dtype: DType) -> usize {
+    dtype.size()
+}

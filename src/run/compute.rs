@@ -1,0 +1,102 @@
+//! Evaluates a program on a loaded brick, step by step, giving buffers back as soon as nobody reads them.
+
+use std::time::Instant;
+
+use super::metrics::Metrics;
+use super::program::Program;
+use super::read::Loaded;
+use super::steps::{Engine, MaskValue};
+use super::trace::Trace;
+use super::value::Value;
+use crate::brick::Scratch;
+use crate::grid::Region;
+use crate::plan::graph::{StepId, WireId};
+
+/// A brick whose sinks are made.
+#[derive(Debug)]
+pub struct Finished {
+    pub brick: Region,
+    /// By wire; only sinks remain.
+    pub values: Vec<Option<Value>>,
+    pub masks: Vec<(StepId, MaskValue)>,
+}
+
+impl Finished {
+    pub fn value(&self, wire: WireId) -> &Value {
+        self.values[wire].as_ref().expect("every sink is delivered")
+    }
+
+    /// The mask of the step that made a wire, over that step's box.
+    pub fn mask(&self, step: StepId) -> Option<&MaskValue> {
+        self.masks.iter().find(|(s, _)| *s == step).map(|(_, m)| m)
+    }
+}
+
+/// Runs every step that the sinks need. Counts the brick as computed, or as skipped and why.
+pub fn evaluate(
+    engine: &Engine,
+    program: &Program,
+    loaded: Loaded,
+    scratch: &mut Scratch,
+    metrics: &Metrics,
+    trace: &Trace,
+) -> Finished {
+    let Loaded { brick, mut values, mut masks, all_missing } = loaded;
+    let plan = engine.plan;
+    let volume = Region::whole(program.volume);
+    let off: Vec<StepId> =
+        masks.iter().filter(|(_, m)| matches!(m, MaskValue::None) && engine.skip).map(|(s, _)| *s).collect();
+    let needed = program.needed(plan, &off);
+    let (mut masked, mut constant, mut ran) = (false, false, false);
+    for (at, &s) in program.steps.iter().enumerate() {
+        let step = &plan.graph.steps[s];
+        if !step.outputs.iter().any(|&w| needed[w]) {
+            continue;
+        }
+        let region = program.step_box(plan, s, brick);
+        if let Some(mask) = &step.mask
+            && !masks.iter().any(|(m, _)| *m == s)
+        {
+            let value = values[mask.wire].as_mut().expect("a mask's wire is made before its reader");
+            masks.push((s, engine.mask(mask, value, region, volume)));
+        }
+        let known = masks.iter().find(|(m, _)| *m == s).map_or(&MaskValue::All, |(_, m)| m);
+        let start = Instant::now();
+        let outputs = if off.contains(&s) {
+            engine.filled(step, region)
+        } else {
+            engine.run(s, &mut values, known, region, volume, scratch)
+        };
+        if matches!(known, MaskValue::None) {
+            masked = true;
+        } else if outputs.iter().all(|v| v.constants().is_some()) {
+            constant = true;
+        } else {
+            ran = true;
+            metrics.step(s, start, region.voxels() as u64);
+            trace.span(&step.stages.join("+"), start, &[("brick", format!("{brick:?}"))]);
+        }
+        for (value, &w) in outputs.into_iter().zip(&step.outputs) {
+            if needed[w] {
+                values[w] = Some(value);
+            } else {
+                value.recycle(engine.pool);
+            }
+        }
+        for w in 0..values.len() {
+            if values[w].is_some() && !program.wanted_after(plan, at, w) {
+                values[w].take().into_iter().for_each(|v| v.recycle(engine.pool));
+            }
+        }
+    }
+    let plain_constant =
+        program.steps.is_empty() && program.sinks.iter().all(|&w| values[w].as_ref().is_some_and(|v| v.constants().is_some()));
+    match (ran, masked, constant || plain_constant) {
+        (true, ..) => metrics.computed(),
+        (false, true, _) => metrics.skipped("where"),
+        (false, false, true) if all_missing => metrics.skipped("missing_chunk"),
+        (false, false, true) => metrics.skipped("constant"),
+        _ => metrics.computed(),
+    }
+    Finished { brick, values, masks }
+}

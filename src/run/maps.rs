@@ -1,0 +1,112 @@
+//! Occlusion maps inside a brick: the chain of levels with its own halo, from the source's voxels down.
+
+use super::assemble::{Assembler, Item, Place, Target, TaskSlot, as_bytes};
+use super::compute::Finished;
+use super::value::Comp;
+use crate::Result;
+use crate::brick::Scratch;
+use crate::grid::{AnyView, Region, View};
+use crate::kernel::Context;
+use crate::kernel::occlusion_map::{Moments, base, coarsen, needed};
+use crate::plan::{MapPlan, OutputPlan};
+
+/// Makes every level of the map that the brick owns; cells of the last one are kept for the levels beyond.
+#[allow(clippy::too_many_arguments)]
+pub fn assemble(
+    assembler: &Assembler,
+    index: usize,
+    output: &OutputPlan,
+    target: &Target,
+    done: &Finished,
+    slot: &TaskSlot,
+    scratch: &mut Scratch,
+    items: &mut Vec<Item>,
+) -> Result<()> {
+    let map = output.map.as_ref().expect("the caller saw a map");
+    let last = output.brick_level();
+    let boxes = chain_boxes(output, map, done.brick);
+    let mut cx = Context { level: assembler.level, scratch };
+    let mut moments = base_level(assembler, output, map, done, boxes[0]);
+    for k in 0..=last {
+        if k > 0 {
+            let layout = &map.chain.levels;
+            let mut coarse = Moments::default();
+            coarsen(&moments, boxes[k - 1], layout[k - 1].shape, layout[k].halved, boxes[k], &mut coarse, &mut cx);
+            moments = coarse;
+        }
+        let own = output.level_box(k, done.brick);
+        if k >= map.first {
+            store(assembler, index, output, target, slot, k, &moments, boxes[k], own, items)?;
+        }
+        if k == last
+            && let Some(spill) = &target.cells
+        {
+            for (plane, values) in [&moments.mean, &moments.variance].into_iter().enumerate() {
+                spill.write(plane, own, as_bytes(&dense(values, boxes[k], own)));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The box of each level, in its own cells, that the brick's levels need.
+fn chain_boxes(output: &OutputPlan, map: &MapPlan, brick: Region) -> Vec<Region> {
+    let last = output.brick_level();
+    let mut boxes = vec![Region::new([0; 3], [0; 3]); last + 1];
+    boxes[last] = output.level_box(last, brick);
+    for k in (0..last).rev() {
+        let layout = &map.chain.levels;
+        let need = needed(boxes[k + 1], layout[k + 1].halved, layout[k].shape);
+        boxes[k] = need.union(&output.level_box(k, brick));
+    }
+    boxes
+}
+
+/// Level 0 of the chain over `region` (counted from the output's start).
+fn base_level(assembler: &Assembler, output: &OutputPlan, map: &MapPlan, done: &Finished, region: Region) -> Moments {
+    let wire = &assembler.plan.graph.wires[map.source];
+    let value = done.value(map.source);
+    let part = region.shift(output.region.lo);
+    let mut moments = Moments::default();
+    match &value.comps[0] {
+        Comp::Voxels(_) => base(value.view(0, part), wire.affine, wire.missing, &mut moments),
+        Comp::Const(v) => {
+            let missing = v.is_nan() || wire.missing.is_some_and(|m| m as f64 == *v);
+            let (mean, variance) = if missing { (f64::NAN, f64::NAN) } else { (wire.affine.apply(*v), 0.0) };
+            moments.mean.resize(region.voxels(), mean);
+            moments.variance.resize(region.voxels(), variance);
+        }
+    }
+    moments
+}
+
+/// Converts and puts the components of one level; `moments` cover `have`, of which `own` is stored.
+#[allow(clippy::too_many_arguments)]
+pub fn store(
+    assembler: &Assembler,
+    index: usize,
+    output: &OutputPlan,
+    target: &Target,
+    slot: &TaskSlot,
+    k: usize,
+    moments: &Moments,
+    have: Region,
+    own: Region,
+    items: &mut Vec<Item>,
+) -> Result<()> {
+    let map = output.map.as_ref().expect("the caller saw a map");
+    for (component, &which) in map.moments.iter().enumerate() {
+        let values = if which == 0 { &moments.mean } else { &moments.variance };
+        let view = AnyView::F64(View::dense(values, have.shape()).part(have.offset_of(&own), own.shape()));
+        let place = Place { index, output, target, component, slot };
+        assembler.store_box(&place, k, own, view, items)?;
+    }
+    Ok(())
+}
+
+/// The part `own` of values that cover `have`, densely packed.
+pub fn dense(values: &[f64], have: Region, own: Region) -> Vec<f64> {
+    let view = View::dense(values, have.shape()).part(have.offset_of(&own), own.shape());
+    let [nz, ny, _] = own.shape();
+    (0..nz).flat_map(|z| (0..ny).flat_map(move |y| view.row_at(z, y).iter().copied())).collect()
+}

@@ -1,0 +1,143 @@
+//! What a run counts while it runs.
+
+use std::collections::BTreeMap;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::Instant;
+
+/// Counters that all threads add to.
+#[derive(Debug)]
+pub struct Metrics {
+    start: Instant,
+    bytes_read: AtomicU64,
+    bytes_written: AtomicU64,
+    voxels_gathered: AtomicU64,
+    chunks_decoded: AtomicU64,
+    bricks_done: AtomicU64,
+    voxels_done: AtomicU64,
+    bricks_computed: AtomicU64,
+    bricks_resumed: AtomicU64,
+    skipped: Mutex<BTreeMap<&'static str, u64>>,
+    waits: Mutex<BTreeMap<&'static str, f64>>,
+    /// Nanoseconds and voxels per step.
+    steps: Vec<(AtomicU64, AtomicU64)>,
+    /// Nanoseconds of reading, converting with levels, and encoding.
+    pub read_ns: AtomicU64,
+    pub encode_ns: AtomicU64,
+    peak: AtomicU64,
+}
+
+impl Metrics {
+    pub fn new(steps: usize) -> Metrics {
+        Metrics {
+            start: Instant::now(),
+            bytes_read: AtomicU64::default(),
+            bytes_written: AtomicU64::default(),
+            voxels_gathered: AtomicU64::default(),
+            chunks_decoded: AtomicU64::default(),
+            bricks_done: AtomicU64::default(),
+            voxels_done: AtomicU64::default(),
+            bricks_computed: AtomicU64::default(),
+            bricks_resumed: AtomicU64::default(),
+            skipped: Mutex::default(),
+            waits: Mutex::default(),
+            steps: (0..steps).map(|_| Default::default()).collect(),
+            read_ns: AtomicU64::default(),
+            encode_ns: AtomicU64::default(),
+            peak: AtomicU64::default(),
+        }
+    }
+
+    pub fn seconds(&self) -> f64 {
+        self.start.elapsed().as_secs_f64()
+    }
+
+    pub fn bytes_read(&self, n: u64) {
+        self.bytes_read.fetch_add(n, Relaxed);
+    }
+
+    pub fn bytes_written(&self, n: u64) {
+        self.bytes_written.fetch_add(n, Relaxed);
+    }
+
+    pub fn gathered(&self, voxels: u64) {
+        self.voxels_gathered.fetch_add(voxels, Relaxed);
+    }
+
+    pub fn chunks_decoded(&self, n: u64) {
+        self.chunks_decoded.fetch_add(n, Relaxed);
+    }
+
+    pub fn brick_done(&self, voxels: u64) {
+        self.bricks_done.fetch_add(1, Relaxed);
+        self.voxels_done.fetch_add(voxels, Relaxed);
+    }
+
+    pub fn computed(&self) {
+        self.bricks_computed.fetch_add(1, Relaxed);
+    }
+
+    pub fn resumed(&self, bricks: u64, voxels: u64) {
+        self.bricks_resumed.fetch_add(bricks, Relaxed);
+        self.bricks_done.fetch_add(bricks, Relaxed);
+        self.voxels_done.fetch_add(voxels, Relaxed);
+    }
+
+    pub fn skipped(&self, cause: &'static str) {
+        *self.skipped.lock().unwrap_or_else(|e| e.into_inner()).entry(cause).or_default() += 1;
+    }
+
+    pub fn waited(&self, cause: &'static str, seconds: f64) {
+        *self.waits.lock().unwrap_or_else(|e| e.into_inner()).entry(cause).or_default() += seconds;
+    }
+
+    pub fn step(&self, step: usize, start: Instant, voxels: u64) {
+        self.steps[step].0.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
+        self.steps[step].1.fetch_add(voxels, Relaxed);
+    }
+
+    /// Seconds in a step's kernels (summed over threads) and voxels that it made, halos included.
+    pub fn step_totals(&self, step: usize) -> (f64, u64) {
+        (self.steps[step].0.load(Relaxed) as f64 * 1e-9, self.steps[step].1.load(Relaxed))
+    }
+
+    /// Bricks and voxels done.
+    pub fn done(&self) -> (u64, u64) {
+        (self.bricks_done.load(Relaxed), self.voxels_done.load(Relaxed))
+    }
+
+    /// Private resident bytes now; remembers the most.
+    pub fn sample_memory(&self) {
+        if let Some(bytes) = private_bytes() {
+            self.peak.fetch_max(bytes, Relaxed);
+        }
+    }
+
+    /// The counted part of a report.
+    pub fn fill(&self, report: &mut super::Report, region_voxels: u64) {
+        report.seconds = self.seconds();
+        report.voxels = region_voxels;
+        report.voxels_per_second = region_voxels as f64 / report.seconds.max(1e-9);
+        report.bricks.computed = self.bricks_computed.load(Relaxed);
+        report.bricks.resumed = self.bricks_resumed.load(Relaxed);
+        let skipped = self.skipped.lock().unwrap_or_else(|e| e.into_inner());
+        report.bricks.skipped = skipped.iter().map(|(k, v)| (k.to_string(), *v)).collect();
+        report.bytes_read = self.bytes_read.load(Relaxed);
+        report.bytes_written = self.bytes_written.load(Relaxed);
+        report.peak_memory_bytes = self.peak.load(Relaxed);
+        let done = self.voxels_done.load(Relaxed).max(1);
+        report.read_amplification = self.voxels_gathered.load(Relaxed) as f64 / done as f64;
+        let waits = self.waits.lock().unwrap_or_else(|e| e.into_inner());
+        report.waits = waits.iter().map(|(k, v)| (k.to_string(), *v)).collect();
+        report.waits.insert("read_busy".into(), self.read_ns.load(Relaxed) as f64 * 1e-9);
+        report.waits.insert("encode_busy".into(), self.encode_ns.load(Relaxed) as f64 * 1e-9);
+    }
+}
+
+/// Private resident memory of this process: anonymous pages, not mapped files.
+pub fn private_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|l| l.starts_with("RssAnon:"))?;
+    let kib: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
+    Some(kib * 1024)
+}

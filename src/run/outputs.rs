@@ -1,0 +1,225 @@
+//! Opening, continuing and finishing outputs, and what they say about themselves.
+
+use std::path::PathBuf;
+
+use serde_json::{Value, json};
+
+use super::assemble::Target;
+use super::journal;
+use crate::config::{Config, Output, provenance};
+use crate::grid::Region;
+use crate::kernel::reduce::planes;
+use crate::plan::{Group, OutputPlan, Plan};
+use crate::store::sink::{Existing, Sink, existing, remove_ours};
+use crate::store::{Spill, VolumeInfo};
+use crate::{Error, Result};
+
+/// What is to be done with the outputs' paths as they are.
+#[derive(Debug, PartialEq)]
+pub enum Start {
+    Afresh,
+    /// Tasks that are done, and the pre-pass results found then.
+    Resume { done: Vec<usize>, globals: Vec<[f64; 2]> },
+    /// Every output is complete already.
+    Complete,
+}
+
+/// The folder that holds the journal: the last output's, since outputs are finished in order.
+pub fn journal_dir(plan: &Plan) -> PathBuf {
+    Sink::work_dir(&plan.outputs.last().expect("a config has outputs").spec.path)
+}
+
+/// Whether output `o` is complete and made by this very config.
+pub fn is_complete(plan: &Plan, o: usize, hash: &str) -> bool {
+    matches!(
+        existing(&plan.outputs[o].spec.path),
+        Existing::Ours { complete: true, occlude: Some(attributes) } if attributes["config_hash"] == hash
+    )
+}
+
+/// Decides by what lies at the outputs' paths. Deletes only what this program wrote.
+pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwrite: bool) -> Result<Start> {
+    let hash = header["config_hash"].as_str().unwrap_or_default();
+    if overwrite {
+        for output in &plan.outputs {
+            clear(config, output)?;
+        }
+        return Ok(Start::Afresh);
+    }
+    let found: Vec<Existing> = plan.outputs.iter().map(|o| existing(&o.spec.path)).collect();
+    if found.iter().all(|f| matches!(f, Existing::None)) {
+        return Ok(Start::Afresh);
+    }
+    for (output, found) in plan.outputs.iter().zip(&found) {
+        if matches!(found, Existing::Foreign) {
+            return Err(refused(config, output, "exists and was not written by this program; choose another path"));
+        }
+        if !resume && !matches!(found, Existing::None) {
+            return Err(refused(config, output, "exists; --resume continues it, --overwrite deletes it first"));
+        }
+    }
+    if (0..plan.outputs.len()).all(|o| is_complete(plan, o, hash)) {
+        return Ok(Start::Complete);
+    }
+    let Some(earlier) = journal::Journal::read(&journal_dir(plan)) else {
+        return no_journal(config, plan, &found);
+    };
+    if let Some(what) = journal::difference(&earlier.header, header) {
+        let last = plan.outputs.last().expect("a config has outputs");
+        let message = format!("was begun with other settings: {what} changed; --overwrite starts afresh");
+        return Err(refused(config, last, &message));
+    }
+    Ok(Start::Resume { done: earlier.done, globals: journal::globals(&earlier.header) })
+}
+
+/// Outputs of ours without a journal: begun and killed before the first line (start afresh), or complete from another run.
+fn no_journal(config: &Config, plan: &Plan, found: &[Existing]) -> Result<Start> {
+    for (output, found) in plan.outputs.iter().zip(found) {
+        if matches!(found, Existing::Ours { complete: true, .. }) {
+            let message = "is complete and was made with other settings; --overwrite deletes it first";
+            return Err(refused(config, output, message));
+        }
+    }
+    for output in &plan.outputs {
+        clear(config, output)?;
+    }
+    Ok(Start::Afresh)
+}
+
+fn config_output<'a>(config: &'a Config, output: &OutputPlan) -> &'a Output {
+    &config.outputs[output.index]
+}
+
+fn refused(config: &Config, output: &OutputPlan, what: &str) -> Error {
+    let place = &config_output(config, output).place;
+    place.error("path", format!("{} {what}", output.spec.path.display())).located(&config.file, place.line)
+}
+
+fn clear(config: &Config, output: &OutputPlan) -> Result<()> {
+    match existing(&output.spec.path) {
+        Existing::None => Ok(()),
+        Existing::Ours { .. } => remove_ours(&output.spec.path),
+        Existing::Foreign => Err(refused(config, output, "was not written by this program, so --overwrite leaves it alone")),
+    }
+}
+
+/// Opens every output of a group that is not complete.
+pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[[f64; 2]], resume: bool) -> Result<Target> {
+    let output = &plan.outputs[o];
+    let sink = Sink::create(output.spec.clone(), resume)?;
+    let dir = Sink::work_dir(&output.spec.path);
+    let parts = output.spec.components.unwrap_or(1);
+    let mut levels = Vec::new();
+    for k in 0..=output.brick_level() {
+        let shared = output.is_zarr() && k >= output.first_level() && !output.owned(k, group);
+        let shape = output.level(k).expect("level exists").shape;
+        let open = || Spill::open(&dir.join(format!("level.{k}")), shape, parts, output.spec.dtype.size());
+        levels.push(shared.then(open).transpose()?);
+    }
+    let deepest = output.brick_level();
+    let cells = (output.level_count() - 1 > deepest).then(|| {
+        let per_cell = if output.map.is_some() { 2 } else { parts * planes(output.reduce) };
+        let shape = output.level(deepest).expect("level exists").shape;
+        Spill::open(&dir.join(format!("cells.{deepest}")), shape, per_cell, size_of::<f64>())
+    });
+    Ok(Target { sink, levels, cells: cells.transpose()?, range: range_of(output, globals) })
+}
+
+/// The values that map to 0 and the largest code, from the config or a pre-pass.
+pub fn range_of(output: &OutputPlan, globals: &[[f64; 2]]) -> Option<[f64; 2]> {
+    match output.auto_range {
+        Some(id) => {
+            let [lo, hi] = Plan::global(globals, id);
+            let usable = lo.is_finite() && hi.is_finite();
+            Some(if !usable { [0.0, 1.0] } else if hi > lo { [lo, hi] } else { [lo, lo + 1.0] })
+        }
+        None => output.range,
+    }
+}
+
+/// Commits what a finished task left in one output.
+pub fn commit_task(group: &Group, output: &OutputPlan, target: &Target, task: Region) -> Result<()> {
+    for k in output.first_level()..=output.brick_level() {
+        if output.owned(k, group) {
+            target.sink.commit(k - output.first_level(), output.level_box(k, task))?;
+        }
+    }
+    for spill in target.levels.iter().flatten().chain(&target.cells) {
+        spill.flush()?;
+    }
+    Ok(())
+}
+
+/// The attribute `occlude` of a finished output.
+pub fn attributes(
+    config: &Config,
+    plan: &Plan,
+    o: usize,
+    infos: &[VolumeInfo],
+    identities: &[Value],
+    hash: &str,
+    range: Option<[f64; 2]>,
+) -> Value {
+    let output = &plan.outputs[o];
+    let lattice = &plan.graph.lattices[output.lattice];
+    let from: Vec<String> = config_output(config, output)
+        .from
+        .iter()
+        .map(|r| r.channel.as_ref().map_or(r.name.clone(), |c| format!("{}.{c}", r.name)))
+        .collect();
+    let inputs: Vec<Value> = config
+        .inputs
+        .iter()
+        .zip(infos)
+        .zip(identities)
+        .map(|((input, info), identity)| {
+            json!({
+                "name": input.name, "identity": identity, "shape": info.shape, "dtype": info.dtype.numpy_name(),
+                "spacing": info.spacing, "unit": info.unit, "slope": info.affine.slope,
+                "intercept": info.affine.intercept, "nodata": info.nodata, "format": info.format,
+            })
+        })
+        .collect();
+    let methods: Vec<Value> = methods(config, &config_output(config, output).from);
+    let integer = !output.spec.dtype.is_float();
+    json!({
+        "complete": true,
+        "version": env!("CARGO_PKG_VERSION"),
+        "config": provenance(&config.text),
+        "config_hash": hash,
+        "input": inputs,
+        "from": from,
+        "stages": methods,
+        "dtype": output.spec.dtype.numpy_name(),
+        "value_range": range.filter(|_| integer),
+        "fill": json_number(output.spec.fill),
+        "polarity": output.openness.then_some("openness: 1 is open, 0 is occluded"),
+        "channel": if output.openness { "openness" } else { "value" },
+        "units": lattice.unit,
+        "spacing": lattice.spacing,
+        "region": [output.region.lo, output.region.hi],
+        "reduce": output.spec.reduce_name,
+        "orientation": infos[lattice.input].orientation.as_ref().map(|o| json!({ "matrix_xyz": o.matrix, "space": o.space })),
+    })
+}
+
+fn json_number(v: f64) -> Value {
+    if v.is_finite() { json!(v) } else { json!(v.to_string()) }
+}
+
+/// Stages that an output hangs on, as the config spells their parameters.
+fn methods(config: &Config, from: &[crate::config::Ref]) -> Vec<Value> {
+    let mut open: Vec<&crate::config::Ref> = from.iter().collect();
+    let mut seen: Vec<&str> = Vec::new();
+    let mut list = Vec::new();
+    while let Some(reference) = open.pop() {
+        let Some(stage) = config.stage(&reference.name) else { continue };
+        if seen.contains(&stage.name.as_str()) {
+            continue;
+        }
+        seen.push(&stage.name);
+        open.extend(stage.reads().into_iter().map(|(_, r)| r));
+        list.push(json!({ "name": stage.name, "op": stage.op.word(), "parameters": format!("{:?}", stage.op) }));
+    }
+    list
+}

@@ -1,0 +1,76 @@
+//! Numbers that need a pass over the whole volume: largest value, value range.
+
+use std::sync::Mutex;
+
+use super::compute::Finished;
+use super::value::Comp;
+use crate::grid::{AnyView, Region, Voxel};
+use crate::plan::graph::WireId;
+use crate::plan::{Plan, PrepassKind};
+
+/// Least and largest value so far, NaN and missing voxels apart. Order never matters.
+#[derive(Debug)]
+pub struct MinMax(Mutex<[f64; 2]>);
+
+impl Default for MinMax {
+    fn default() -> Self {
+        MinMax(Mutex::new([f64::INFINITY, f64::NEG_INFINITY]))
+    }
+}
+
+impl MinMax {
+    /// Takes in a finished brick's wires.
+    pub fn add(&self, plan: &Plan, wires: &[WireId], done: &Finished) {
+        let mut found = [f64::INFINITY, f64::NEG_INFINITY];
+        for &w in wires {
+            let (value, wire) = (done.value(w), &plan.graph.wires[w]);
+            for (c, comp) in value.comps.iter().enumerate() {
+                let part = match comp {
+                    Comp::Const(v) => (!v.is_nan() && wire.missing.is_none_or(|m| m as f64 != *v)).then_some([*v, *v]),
+                    Comp::Voxels(_) => extremes(value.view(c, done.brick), wire.missing),
+                };
+                if let Some([a, b]) = part.map(|p| p.map(|v| wire.affine.apply(v))) {
+                    found = [found[0].min(a).min(b), found[1].max(a).max(b)];
+                }
+            }
+        }
+        let mut all = self.0.lock().unwrap_or_else(|e| e.into_inner());
+        *all = [all[0].min(found[0]), all[1].max(found[1])];
+    }
+
+    /// The result; `Max` of nothing is 0.
+    pub fn result(self, kind: PrepassKind) -> [f64; 2] {
+        let found = self.0.into_inner().unwrap_or_else(|e| e.into_inner());
+        match (kind, found[0] <= found[1]) {
+            (_, true) => found,
+            (PrepassKind::Max, false) => [0.0, 0.0],
+            (PrepassKind::MinMax, false) => [0.0, 1.0],
+        }
+    }
+}
+
+/// Least and largest stored value of a view, or `None` where nothing counts.
+fn extremes(view: AnyView, missing: Option<i64>) -> Option<[f64; 2]> {
+    fn run<T: Voxel>(v: crate::grid::View<T>, missing: Option<T>) -> Option<[f64; 2]> {
+        let mut found: Option<[T; 2]> = None;
+        for i in Region::new([0; 3], [v.shape[0] as i64, v.shape[1] as i64, 1]).iter() {
+            for &x in v.row_at(i[0] as usize, i[1] as usize) {
+                // NaN equals nothing, itself included.
+                #[allow(clippy::eq_op)]
+                if x != x || missing == Some(x) {
+                    continue;
+                }
+                found = Some(match found {
+                    None => [x, x],
+                    Some([a, b]) => [if x < a { x } else { a }, if x > b { x } else { b }],
+                });
+            }
+        }
+        found.map(|f| f.map(T::to_f64))
+    }
+    crate::with_view!(AnyView, view, v => run(v, missing.map(|m| cast_like(v.data, m))))
+}
+
+fn cast_like<T: Voxel>(_: &[T], value: i64) -> T {
+    T::from_f64(value as f64)
+}

@@ -1,0 +1,67 @@
+//! What is evaluated for each brick: steps in order, wires to deliver, and when a buffer is free again.
+
+use crate::grid::{Region, Shape};
+use crate::plan::graph::{StepId, WireId};
+use crate::plan::memory::wire_box;
+use crate::plan::tasks::{Group, input_halo, inputs_of};
+use crate::plan::{Plan, Prepass};
+
+/// A pruned sub-graph for one stream of bricks.
+#[derive(Debug)]
+pub struct Program {
+    pub steps: Vec<StepId>,
+    /// Wires whose values are delivered.
+    pub sinks: Vec<WireId>,
+    /// Input wires with the halo to read.
+    pub inputs: Vec<(WireId, [usize; 3])>,
+    pub volume: Shape,
+}
+
+impl Program {
+    /// The main stream of a group.
+    pub fn of_group(plan: &Plan, group: &Group) -> Program {
+        let mut sinks = group.sinks.clone();
+        for map in group.outputs.iter().filter_map(|&o| plan.outputs[o].map.as_ref()) {
+            if !sinks.contains(&map.source) {
+                sinks.push(map.source);
+            }
+        }
+        let inputs = group.inputs.iter().map(|&w| (w, input_halo(plan, group, w))).collect();
+        Program { steps: group.steps.clone(), sinks, inputs, volume: group.shape }
+    }
+
+    /// The stream of a pre-pass over the whole volume.
+    pub fn of_prepass(plan: &Plan, prepass: &Prepass, volume: Shape) -> Program {
+        let steps = plan.steps_for(&prepass.wires);
+        let inputs = inputs_of(plan, &steps, &prepass.wires);
+        let inputs = inputs.into_iter().map(|w| (w, plan.graph.wires[w].halo)).collect();
+        Program { steps, sinks: prepass.wires.clone(), inputs, volume }
+    }
+
+    /// Whether a wire is still wanted after the step at position `at`.
+    pub fn wanted_after(&self, plan: &Plan, at: usize, wire: WireId) -> bool {
+        self.sinks.contains(&wire)
+            || self.steps[at + 1..].iter().any(|&s| {
+                let step = &plan.graph.steps[s];
+                step.inputs.contains(&wire) || step.mask.as_ref().is_some_and(|m| m.wire == wire)
+            })
+    }
+
+    /// The box of a step's outputs for a brick.
+    pub fn step_box(&self, plan: &Plan, step: StepId, brick: Region) -> Region {
+        wire_box(brick, plan.graph.steps[step].halo, self.volume)
+    }
+
+    /// Wires that must be made or read, given the steps that a mask switched off.
+    pub fn needed(&self, plan: &Plan, switched_off: &[StepId]) -> Vec<bool> {
+        let mut needed = vec![false; plan.graph.wires.len()];
+        self.sinks.iter().for_each(|&w| needed[w] = true);
+        for &s in self.steps.iter().rev() {
+            let step = &plan.graph.steps[s];
+            if !switched_off.contains(&s) && step.outputs.iter().any(|&w| needed[w]) {
+                step.inputs.iter().chain(step.mask.as_ref().map(|m| &m.wire)).for_each(|&w| needed[w] = true);
+            }
+        }
+        needed
+    }
+}

@@ -1,0 +1,171 @@
+//! Fills a brick's inputs, halos included, from sources: plain rows or cached chunks. Masks that hang on inputs are
+//! looked at first, so that what no mask needs is not read.
+
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Instant;
+
+use super::cache::{Chunk, ChunkCache, Uses};
+use super::metrics::Metrics;
+use super::program::Program;
+use super::steps::{Engine, MaskValue};
+use super::value::{Comp, Value, common_value, copy_into};
+use crate::Result;
+use crate::grid::{Region, Voxel};
+use crate::plan::graph::{Producer, StepId, WireId};
+use crate::plan::memory::wire_box;
+use crate::store::Source;
+
+/// A brick with its inputs.
+#[derive(Debug)]
+pub struct Loaded {
+    pub brick: Region,
+    /// By wire.
+    pub values: Vec<Option<Value>>,
+    /// Masks known so far, by step.
+    pub masks: Vec<(StepId, MaskValue)>,
+    /// Every input that was read turned out missing from storage.
+    pub all_missing: bool,
+}
+
+/// Reads for one stream.
+pub struct Reader<'a> {
+    pub engine: &'a Engine<'a>,
+    pub program: &'a Program,
+    /// By the config's input index.
+    pub sources: &'a [Source],
+    pub cache: &'a ChunkCache,
+    /// By the config's input index, for chunked sources.
+    pub uses: Vec<Option<Uses>>,
+    pub metrics: &'a Metrics,
+}
+
+impl Reader<'_> {
+    pub fn read(&self, brick: Region) -> Result<Loaded> {
+        let start = Instant::now();
+        let plan = self.engine.plan;
+        let volume = Region::whole(self.program.volume);
+        let mut loaded = Loaded {
+            brick,
+            values: (0..plan.graph.wires.len()).map(|_| None).collect(),
+            masks: Vec::new(),
+            all_missing: true,
+        };
+        let mut off = Vec::new();
+        for &s in &self.program.steps {
+            let Some(mask) = &plan.graph.steps[s].mask else { continue };
+            let Producer::Input(input) = plan.graph.wires[mask.wire].producer else { continue };
+            let region = self.program.step_box(plan, s, brick);
+            let wanted = region.grow(mask.reach).clip(&volume);
+            let (mut value, _) = self.input(input, mask.wire, wanted, false)?;
+            let known = self.engine.mask(mask, &mut value, region, volume);
+            value.recycle(self.engine.pool);
+            if matches!(known, MaskValue::None) && self.engine.skip {
+                off.push(s);
+            }
+            loaded.masks.push((s, known));
+        }
+        let needed = self.program.needed(plan, &off);
+        for &(wire, halo) in &self.program.inputs {
+            if !needed[wire] {
+                continue;
+            }
+            let Producer::Input(input) = plan.graph.wires[wire].producer else { continue };
+            let region = wire_box(brick, halo, self.program.volume);
+            let (value, missing) = self.input(input, wire, region, true)?;
+            self.metrics.gathered(region.voxels() as u64);
+            loaded.all_missing &= missing;
+            loaded.values[wire] = Some(value);
+        }
+        self.metrics.read_ns.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
+        Ok(loaded)
+    }
+
+    /// All components of an input over a box, and whether nothing of it is stored.
+    fn input(&self, input: usize, wire: WireId, region: Region, counts: bool) -> Result<(Value, bool)> {
+        let wire = &self.engine.plan.graph.wires[wire];
+        let mut all_missing = true;
+        let comps = (0..wire.components)
+            .map(|c| {
+                let (comp, missing) = match &self.uses[input] {
+                    Some(uses) => self.chunked(input, c, region, uses, counts)?,
+                    None => (self.plain(input, c, region)?, false),
+                };
+                all_missing &= missing;
+                Ok(match comp {
+                    Comp::Voxels(v) if self.engine.skip => match common_value(v.view(region.shape())) {
+                        Some(value) => {
+                            self.engine.pool.put(v);
+                            Comp::Const(value)
+                        }
+                        None => Comp::Voxels(v),
+                    },
+                    comp => comp,
+                })
+            })
+            .collect::<Result<Vec<_>>>()?;
+        Ok((Value { dtype: wire.dtype, region, comps }, all_missing))
+    }
+
+    fn plain(&self, input: usize, comp: usize, region: Region) -> Result<Comp> {
+        let source = &self.sources[input];
+        let mut voxels = self.engine.pool.take(source.info().dtype, region.voxels());
+        let bytes = source.read(comp, region, voxels.view_mut(region.shape()))?;
+        self.metrics.bytes_read(bytes);
+        Ok(Comp::Voxels(voxels))
+    }
+
+    fn chunked(&self, input: usize, comp: usize, region: Region, uses: &Uses, counts: bool) -> Result<(Comp, bool)> {
+        let source = &self.sources[input];
+        let info = source.info();
+        let shape = info.chunk.expect("a chunked source");
+        let cells = uses.chunks(region);
+        let mut target = None;
+        let mut common: Option<f64> = None;
+        for index in cells.iter() {
+            // A mask's look does not count: the brick itself may follow.
+            let uses = if counts { uses.of(index) } else { u32::MAX };
+            let chunk = self.cache.get(source, (input, comp, index), uses, self.engine.pool, self.metrics)?;
+            let chunk_box = Region::of_cell(index, [0; 3], shape);
+            if let (Chunk::Missing(value), None) = (&chunk, &target)
+                && self.engine.skip
+                && (common.is_none() || common.is_some_and(|c| c.to_bits() == value.to_bits()))
+            {
+                common = Some(*value);
+                continue;
+            }
+            let dst = target.get_or_insert_with(|| {
+                let mut buffer = self.engine.pool.take(info.dtype, region.voxels());
+                if let Some(value) = common {
+                    buffer.fill(value);
+                }
+                buffer
+            });
+            match &chunk {
+                Chunk::Missing(value) => fill_box(dst, region, chunk_box, *value),
+                Chunk::Decoded(voxels) => copy_into(voxels.view(shape), chunk_box, dst, region),
+            }
+        }
+        Ok(match (target, common) {
+            (Some(voxels), _) => (Comp::Voxels(voxels), false),
+            (None, Some(value)) => (Comp::Const(value), true),
+            (None, None) => unreachable!("a brick's box is not empty"),
+        })
+    }
+}
+
+/// Sets the part of a dense buffer over `region` that `part` covers.
+fn fill_box(dst: &mut crate::brick::Voxels, region: Region, part: Region, value: f64) {
+    fn run<T: Voxel>(mut v: crate::grid::ViewMut<T>, region: Region, part: Region, value: f64) {
+        let common = part.clip(&region);
+        if common.is_empty() {
+            return;
+        }
+        let (at, n) = (region.offset_of(&common), common.shape());
+        for z in 0..n[0] {
+            for y in 0..n[1] {
+                v.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + n[2]].fill(T::from_f64(value));
+            }
+        }
+    }
+    crate::with_view!(AnyViewMut, dst.view_mut(region.shape()), v => run(v, region, part, value));
+}

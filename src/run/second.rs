@@ -1,0 +1,157 @@
+//! The second phase: levels whose files several tasks share, and levels coarser than bricks make. Everything is read from
+//! scratch, chunk by chunk, so memory does not grow with the volume.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::assemble::{Target, as_bytes};
+use super::maps::dense;
+use crate::Result;
+use crate::brick::{Scratch, Voxels};
+use crate::grid::{AnyView, Region, View};
+use crate::kernel::convert::{Mapping, convert_at};
+use crate::kernel::occlusion_map::{Moments, coarsen, needed};
+use crate::kernel::reduce::{Cells, planes};
+use crate::kernel::simd::Level;
+use crate::kernel::Context;
+use crate::plan::OutputPlan;
+use crate::store::Spill;
+
+/// Finishes all levels of one output. Idempotent: a killed second phase is simply done again.
+pub fn finish_levels(output: &OutputPlan, target: &Target, work_dir: &Path, pool: &rayon::ThreadPool) -> Result<u64> {
+    pool.install(|| {
+        let mut bytes = 0;
+        for k in output.first_level()..=output.brick_level() {
+            if let Some(spill) = &target.levels[k] {
+                bytes += shared_level(output, target, spill, k)?;
+            }
+        }
+        let mut fine = None;
+        for k in output.brick_level() + 1..output.level_count() {
+            let spill = fine.as_ref().or(target.cells.as_ref()).expect("cells were kept for the levels beyond");
+            let (written, next) = coarse_level(output, target, spill, work_dir, k)?;
+            bytes += written;
+            fine = Some(next);
+        }
+        Ok(bytes)
+    })
+}
+
+/// Boxes of the chunks of level `k`.
+fn chunks(output: &OutputPlan, k: usize) -> Vec<Region> {
+    let whole = Region::whole(output.level(k).expect("level exists").shape);
+    let cells = whole.cells([0; 3], output.spec.chunk);
+    cells.iter().map(|i| Region::of_cell(i, [0; 3], output.spec.chunk).clip(&whole)).collect()
+}
+
+fn components(output: &OutputPlan) -> usize {
+    output.spec.components.unwrap_or(1)
+}
+
+/// Encodes a level whose rounded voxels tasks left in scratch.
+fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize) -> Result<u64> {
+    let dataset = k - output.first_level();
+    let one = |(component, region): (usize, Region)| {
+        let mut voxels = Voxels::zeroed(output.spec.dtype, region.voxels());
+        spill.read(component, region, voxels.as_bytes_mut());
+        let chunk = target.sink.encode(dataset, region, voxels.view(region.shape()))?;
+        target.sink.put(dataset, component, region, chunk)
+    };
+    let all: Vec<(usize, Region)> =
+        (0..components(output)).flat_map(|c| chunks(output, k).into_iter().map(move |r| (c, r))).collect();
+    let bytes = all.into_par_iter().map(one).try_reduce(|| 0, |a, b| Ok(a + b))?;
+    target.sink.commit(dataset, Region::whole(output.level(k).expect("level exists").shape))?;
+    Ok(bytes)
+}
+
+/// Makes level `k` from the cells of level `k - 1`; returns the bytes written and the cells of level `k`.
+fn coarse_level(output: &OutputPlan, target: &Target, fine: &Spill, work_dir: &Path, k: usize) -> Result<(u64, Spill)> {
+    let layout = output.level(k).expect("level exists");
+    let per_component = if output.map.is_some() { 2 } else { components(output) * planes(output.reduce) };
+    let next = Spill::open(&work_dir.join(format!("cells.{k}")), layout.shape, per_component, size_of::<f64>())?;
+    let regions = chunks(output, k);
+    let bytes = regions
+        .into_par_iter()
+        .map(|region| match output.map {
+            Some(_) => map_chunk(output, target, fine, &next, k, region),
+            None => cells_chunk(output, target, fine, &next, k, region),
+        })
+        .try_reduce(|| 0, |a, b| Ok(a + b))?;
+    target.sink.commit(k - output.first_level(), Region::whole(layout.shape))?;
+    Ok((bytes, next))
+}
+
+fn read_plane(spill: &Spill, plane: usize, region: Region) -> Vec<f64> {
+    let mut voxels = Voxels::zeroed(crate::grid::DType::F64, region.voxels());
+    spill.read(plane, region, voxels.as_bytes_mut());
+    match voxels {
+        Voxels::F64(v) => v,
+        _ => unreachable!("made as f64"),
+    }
+}
+
+/// One chunk, all components, of reduced cells.
+fn cells_chunk(output: &OutputPlan, target: &Target, fine: &Spill, next: &Spill, k: usize, region: Region) -> Result<u64> {
+    let (layout, below) = (output.level(k).expect("level exists"), output.level(k - 1).expect("level exists"));
+    let step: [i64; 3] = layout.halved.map(|h| 1 + i64::from(h));
+    let scaled = |v: [i64; 3]| std::array::from_fn(|a| v[a] * step[a]);
+    let children = Region::new(scaled(region.lo), scaled(region.hi)).clip(&Region::whole(below.shape));
+    let level_0 = output.region.shape();
+    let extent = std::array::from_fn(|a| {
+        let f = below.factor[a];
+        (children.hi[a] as usize * f).min(level_0[a]) - children.lo[a] as usize * f
+    });
+    let mut scratch = Scratch::new();
+    let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+    let (mut source, mut cells, mut bytes) = (Cells::default(), Cells::default(), 0);
+    let n_planes = planes(output.reduce);
+    for component in 0..components(output) {
+        let data: Vec<f64> = (0..n_planes).flat_map(|p| read_plane(fine, component * n_planes + p, children)).collect();
+        source.load(output.reduce, output.is_std, below.factor, extent, &data);
+        cells.next_from(&source, layout.halved, &mut cx);
+        let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
+        cells.write([0; 3], mapping(output, target), rounded.view_mut(region.shape()), &mut cx);
+        bytes += store(output, target, k, component, region, &rounded)?;
+        let mut stored = Vec::new();
+        cells.store(&mut stored);
+        for (p, plane) in stored.chunks_exact(region.voxels()).enumerate() {
+            next.write(component * n_planes + p, region, as_bytes(plane));
+        }
+    }
+    Ok(bytes)
+}
+
+/// One chunk of an occlusion map's chain.
+fn map_chunk(output: &OutputPlan, target: &Target, fine: &Spill, next: &Spill, k: usize, region: Region) -> Result<u64> {
+    let map = output.map.as_ref().expect("the caller saw a map");
+    let (layout, below) = (&map.chain.levels[k], &map.chain.levels[k - 1]);
+    let from = needed(region, layout.halved, below.shape);
+    let source = Moments { mean: read_plane(fine, 0, from), variance: read_plane(fine, 1, from) };
+    let mut scratch = Scratch::new();
+    let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+    let mut made = Moments::default();
+    coarsen(&source, from, below.shape, layout.halved, region, &mut made, &mut cx);
+    let mut bytes = 0;
+    for (component, &which) in map.moments.iter().enumerate() {
+        let values = if which == 0 { &made.mean } else { &made.variance };
+        let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
+        let view = AnyView::F64(View::dense(values, region.shape()));
+        convert_at(Level::detect(), view, mapping(output, target), rounded.view_mut(region.shape()));
+        bytes += store(output, target, k, component, region, &rounded)?;
+    }
+    for (plane, values) in [&made.mean, &made.variance].into_iter().enumerate() {
+        next.write(plane, region, as_bytes(&dense(values, region, region)));
+    }
+    Ok(bytes)
+}
+
+fn mapping(output: &OutputPlan, target: &Target) -> Mapping {
+    Mapping { range: target.range, fill: output.spec.fill }
+}
+
+fn store(output: &OutputPlan, target: &Target, k: usize, component: usize, region: Region, voxels: &Voxels) -> Result<u64> {
+    let dataset = k - output.first_level();
+    let chunk = target.sink.encode(dataset, region, voxels.view(region.shape()))?;
+    target.sink.put(dataset, component, region, chunk)
+}

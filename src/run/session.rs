@@ -1,0 +1,435 @@
+//! A run as library calls: open, `run_task(i)` in any order, finish.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use super::assemble::{Assembler, Item, Target, TaskSlot};
+use super::cache::{ChunkCache, Uses};
+use super::compute::Finished;
+use super::journal::{self, Journal};
+use super::metrics::Metrics;
+use super::options::{Progress, RunOptions};
+use super::outputs::{self, Start};
+use super::prepass::MinMax;
+use super::program::Program;
+use super::read::Reader;
+use super::report::{Report, StageReport};
+use super::steps::Engine;
+use super::stream::{Stream, Work};
+use super::trace::Trace;
+use super::second;
+use crate::brick::{Pool, Scratch};
+use crate::config::{Config, config_hash};
+use crate::grid::{Region, order::morton};
+use crate::plan::{BrickChoice, Group, Plan};
+use crate::store::sink::Sink;
+use crate::store::{Source, VolumeInfo, open_inputs};
+use crate::{Error, Result};
+
+/// One run, opened.
+pub struct Session<'a> {
+    config: &'a Config,
+    options: &'a RunOptions,
+    progress: &'a dyn Progress,
+    plan: Plan,
+    infos: Vec<VolumeInfo>,
+    identities: Vec<Value>,
+    hash: String,
+    sources: Vec<Source>,
+    /// By output; `None` for those that were complete when the run was opened.
+    targets: Vec<Option<Target>>,
+    journal: Option<Journal>,
+    done: Vec<bool>,
+    globals: Vec<[f64; 2]>,
+    threads: rayon::ThreadPool,
+    pool: Pool,
+    metrics: Metrics,
+    trace: Trace,
+    /// Folders to remove at the end.
+    scratch: Option<PathBuf>,
+    last_tick: AtomicU64,
+}
+
+impl<'a> Session<'a> {
+    /// Plans, unpacks inputs where needed, runs the pre-passes, opens the outputs.
+    pub fn open(config: &'a Config, options: &'a RunOptions, progress: &'a dyn Progress) -> Result<Session<'a>> {
+        let sources = open_inputs(config)?;
+        let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
+        let plan = Plan::new(config, &infos)?;
+        plan.warnings.iter().for_each(|w| progress.note(w));
+        let identities = sources.iter().map(Source::identity).collect::<Result<Vec<_>>>()?;
+        let hash = config_hash(config);
+        let placement = json!(plan.placement.iter().map(|(n, d, _)| (n.clone(), *d)).collect::<Vec<_>>());
+        let header = journal::header(&hash, &identities, plan.task_count(), &placement, &[]);
+        let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
+        let threads = rayon::ThreadPoolBuilder::new()
+            .num_threads(plan.threads)
+            .thread_name(|i| format!("compute-{i}"))
+            .build()
+            .map_err(|e| Error::Failed(format!("cannot start {} threads: {e}", plan.threads)))?;
+        let tasks = plan.task_count();
+        let mut session = Session {
+            config,
+            options,
+            progress,
+            metrics: Metrics::new(plan.graph.steps.len()),
+            targets: plan.outputs.iter().map(|_| None).collect(),
+            plan,
+            infos,
+            identities,
+            hash,
+            sources,
+            journal: None,
+            done: vec![false; tasks],
+            globals: Vec::new(),
+            threads,
+            pool: Pool::default(),
+            trace: Trace::new(options.trace.is_some()),
+            scratch: None,
+            last_tick: AtomicU64::new(0),
+        };
+        session.prepare(start, header)?;
+        Ok(session)
+    }
+
+    fn prepare(&mut self, start: Start, mut header: Value) -> Result<()> {
+        let resume = match start {
+            Start::Complete => {
+                self.done.fill(true);
+                return Ok(());
+            }
+            Start::Afresh => false,
+            Start::Resume { done, globals } => {
+                for task in done {
+                    if let Some(flag) = self.done.get_mut(task) {
+                        *flag = true;
+                    }
+                }
+                self.globals = globals;
+                true
+            }
+        };
+        if self.done.contains(&false) || self.globals.len() < self.plan.prepasses.len() {
+            self.unpack()?;
+        }
+        for id in self.globals.len()..self.plan.prepasses.len() {
+            let found = self.prepass(id)?;
+            self.globals.push(found);
+        }
+        header["globals"] = journal::header("", &[], 0, &Value::Null, &self.globals)["globals"].clone();
+        for g in 0..self.plan.groups.len() {
+            for &o in &self.plan.groups[g].outputs {
+                if !resume || !outputs::is_complete(&self.plan, o, &self.hash) {
+                    let target = outputs::open_target(&self.plan, &self.plan.groups[g], o, &self.globals, resume)?;
+                    self.targets[o] = Some(target);
+                }
+            }
+        }
+        self.journal = Some(Journal::open(&outputs::journal_dir(&self.plan), &header, resume)?);
+        Ok(())
+    }
+
+    /// Unpacks gzip and re-blocks compressed planes, once, into scratch.
+    fn unpack(&mut self) -> Result<()> {
+        let total: u64 = self.sources.iter().map(Source::spool_bytes).sum();
+        let first = &self.config.outputs[0].path;
+        let beside = first.parent().map_or_else(|| PathBuf::from("."), PathBuf::from);
+        let base = self.config.run.scratch.clone().unwrap_or(beside);
+        let dir = base.join(format!(".occlude-scratch-{}", std::process::id()));
+        if total > 0 {
+            std::fs::create_dir_all(&dir).map_err(|e| Error::file(&dir, format!("cannot create scratch: {e}")))?;
+            self.scratch = Some(dir.clone());
+        }
+        for source in &mut self.sources {
+            let cancel = &self.options.cancel;
+            source.prepare(&dir, &|bytes| {
+                self.progress.update(bytes, total, 0, 0, "unpack");
+                !cancel.is_cancelled()
+            })?;
+        }
+        self.options.cancel.check()
+    }
+
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    pub fn task_count(&self) -> usize {
+        self.done.len()
+    }
+
+    /// Tasks that are not done, in visiting order: along a Morton curve in each group.
+    pub fn open_tasks(&self) -> Vec<usize> {
+        let mut tasks = Vec::new();
+        for group in &self.plan.groups {
+            let mut own: Vec<usize> = (0..group.task_count()).collect();
+            own.sort_by_key(|&t| {
+                let [_, ny, nx] = group.tasks;
+                morton([t / (ny * nx), t / nx % ny, t % nx].map(|v| v as i64))
+            });
+            tasks.extend(own.into_iter().map(|t| t + group.first_task).filter(|&t| !self.done[t]));
+        }
+        tasks
+    }
+
+    /// Runs one task by number. Idempotent; disjoint from every other task.
+    pub fn run_task(&self, task: usize) -> Result<()> {
+        self.run_tasks(&[task])
+    }
+
+    /// Streams the bricks of these tasks, group by group, marking each task as it finishes.
+    pub fn run_tasks(&self, tasks: &[usize]) -> Result<()> {
+        for (g, group) in self.plan.groups.iter().enumerate() {
+            let own = |t: &usize| (group.first_task..group.first_task + group.task_count()).contains(t);
+            let mine: Vec<usize> = tasks.iter().copied().filter(own).collect();
+            self.count_resumed(group);
+            if !mine.is_empty() {
+                self.stream_group(g, &mine)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn count_resumed(&self, group: &Group) {
+        for t in 0..group.task_count() {
+            if self.done[group.first_task + t] {
+                let region = group.task_region(t);
+                self.metrics.resumed(group.bricks(region).len() as u64, region.voxels() as u64);
+            }
+        }
+    }
+
+    fn stream_group(&self, g: usize, tasks: &[usize]) -> Result<()> {
+        let group = &self.plan.groups[g];
+        let program = Program::of_group(&self.plan, group);
+        let engine = self.engine();
+        let mut work = Vec::new();
+        let mut slots = Vec::new();
+        for &task in tasks {
+            let region = group.task_region(task - group.first_task);
+            let bricks = group.bricks(region);
+            slots.push(TaskSlot::new(task, region, bricks.len()));
+            work.extend(bricks.into_iter().map(|brick| Work { brick, slot: slots.len() - 1 }));
+        }
+        let assembler = Assembler {
+            plan: &self.plan,
+            group,
+            targets: &self.targets,
+            pool: &self.pool,
+            level: engine.level,
+        };
+        let deliver =
+            |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
+        let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items);
+        self.stream(&engine, &program, &group.brick, &work, &deliver, &write)
+    }
+
+    fn engine(&self) -> Engine<'_> {
+        let mut engine = Engine::new(&self.plan, &self.pool, !self.options.no_skip);
+        engine.globals = self.globals.clone();
+        engine
+    }
+
+    /// Stores a brick's chunks; after the last brick of a task, commits and marks it.
+    fn write(&self, group: &Group, slot: &TaskSlot, items: Vec<Item>) -> Result<()> {
+        for item in items {
+            let target = self.targets[item.output].as_ref().expect("bricks go to open outputs");
+            let bytes = target.sink.put(item.dataset, item.component, item.region, item.chunk)?;
+            self.metrics.bytes_written(bytes);
+        }
+        if slot.written() {
+            let start = Instant::now();
+            for &o in &group.outputs {
+                if let Some(target) = &self.targets[o] {
+                    outputs::commit_task(group, &self.plan.outputs[o], target, slot.region)?;
+                }
+            }
+            if let Some(journal) = &self.journal {
+                journal.done(slot.number)?;
+            }
+            self.trace.span("commit", start, &[("task", slot.number.to_string())]);
+        }
+        Ok(())
+    }
+
+    /// Least and largest value of a pre-pass's wires over the whole volume.
+    fn prepass(&self, id: usize) -> Result<[f64; 2]> {
+        let prepass = &self.plan.prepasses[id];
+        let lattice = &self.plan.graph.lattices[self.plan.graph.wires[prepass.wires[0]].lattice];
+        let group = self.plan.groups.iter().find(|g| g.shape == lattice.shape).unwrap_or(&self.plan.groups[0]);
+        let program = Program::of_prepass(&self.plan, prepass, lattice.shape);
+        let engine = self.engine();
+        let whole = Region::whole(lattice.shape);
+        let mut cells: Vec<[i64; 3]> = whole.cells([0; 3], group.brick.shape).iter().collect();
+        cells.sort_by_key(|c| morton(*c));
+        let bricks = cells.into_iter().map(|c| Region::of_cell(c, [0; 3], group.brick.shape).clip(&whole));
+        let work: Vec<Work> = bricks.map(|brick| Work { brick, slot: 0 }).collect();
+        let found = MinMax::default();
+        let deliver = |done: &Finished, _: Work, _: &mut Scratch| {
+            found.add(&self.plan, &prepass.wires, done);
+            Ok(Vec::new())
+        };
+        self.stream(&engine, &program, &group.brick, &work, &deliver, &|_, _| Ok(()))?;
+        Ok(found.result(prepass.kind))
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn stream(
+        &self,
+        engine: &Engine,
+        program: &Program,
+        brick: &BrickChoice,
+        work: &[Work],
+        deliver: &(dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync),
+        write: &(dyn Fn(Work, Vec<Item>) -> Result<()> + Sync),
+    ) -> Result<()> {
+        let cache = ChunkCache::new(brick.cache);
+        let reader = Reader {
+            engine,
+            program,
+            sources: &self.sources,
+            cache: &cache,
+            uses: self.uses(program, work),
+            metrics: &self.metrics,
+        };
+        let stream = Stream {
+            reader: &reader,
+            work,
+            brick_bytes: brick.bytes,
+            budget: brick.bytes * brick.in_flight as u64,
+            brick_voxels: brick.shape.iter().map(|&n| n as u64).product(),
+            threads: self.plan.threads,
+            pool: &self.threads,
+            metrics: &self.metrics,
+            trace: &self.trace,
+            cancel: &self.options.cancel,
+            deliver,
+            write,
+            tick: &|| self.tick(brick),
+        };
+        stream.run()
+    }
+
+    /// How often each chunk of each chunked input will be read by the work ahead.
+    fn uses(&self, program: &Program, work: &[Work]) -> Vec<Option<Uses>> {
+        let by_input = |input: usize| {
+            let chunk = self.infos[input].chunk?;
+            let halo = program.inputs.iter().find_map(|&(w, halo)| {
+                (self.plan.graph.wires[w].producer == crate::plan::graph::Producer::Input(input)).then_some(halo)
+            })?;
+            let volume = self.infos[input].shape;
+            let intervals = std::array::from_fn(|a| {
+                let mut list: Vec<(i64, i64)> = work
+                    .iter()
+                    .map(|w| {
+                        let grown = crate::plan::memory::wire_box(w.brick, halo, volume);
+                        (grown.lo[a], grown.hi[a])
+                    })
+                    .collect();
+                list.sort_unstable();
+                list.dedup();
+                list
+            });
+            Some(Uses::new(&intervals, chunk, volume))
+        };
+        (0..self.sources.len()).map(by_input).collect()
+    }
+
+    /// After each brick: pages of mapped inputs behind the front are let go, the pool is kept small, progress is told.
+    fn tick(&self, brick: &BrickChoice) {
+        let now = (self.metrics.seconds() * 1e3) as u64;
+        let last = self.last_tick.load(Ordering::Relaxed);
+        let (bricks, voxels) = self.metrics.done();
+        let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
+        let due = now >= last + 100 || bricks == total;
+        if due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok() {
+            self.pool.trim((brick.bytes * brick.in_flight as u64 / 2) as usize);
+            for source in &self.sources {
+                source.release(Region::whole(source.info().shape));
+            }
+            self.progress.update(voxels, self.plan.voxels(), bricks, total, "compute");
+        }
+    }
+
+    /// The second phase and the attributes; then the outputs are complete.
+    pub fn finish(mut self) -> Result<Report> {
+        let start = Instant::now();
+        for o in 0..self.plan.outputs.len() {
+            let Some(target) = self.targets[o].take() else { continue };
+            let output = &self.plan.outputs[o];
+            let dir = Sink::work_dir(&output.spec.path);
+            let bytes = second::finish_levels(output, &target, &dir, &self.threads)?;
+            self.metrics.bytes_written(bytes);
+            let attributes = outputs::attributes(
+                self.config,
+                &self.plan,
+                o,
+                &self.infos,
+                &self.identities,
+                &self.hash,
+                target.range,
+            );
+            let windows = self.windows(o);
+            let Target { sink, levels, cells, .. } = target;
+            drop((levels, cells)); // their files go with the work folder
+            for k in 0..=output.level_count() {
+                let _ = std::fs::remove_file(dir.join(format!("level.{k}")));
+                let _ = std::fs::remove_file(dir.join(format!("cells.{k}")));
+            }
+            sink.finish(&attributes, &windows)?;
+        }
+        if let Some(journal) = self.journal.take() {
+            drop(journal);
+            journal::remove(&outputs::journal_dir(&self.plan));
+        }
+        self.trace.span("finish", start, &[]);
+        if let Some(path) = &self.options.trace {
+            self.trace.write(path)?;
+        }
+        self.metrics.sample_memory();
+        Ok(self.report())
+    }
+
+    /// Display windows of each component for `omero`.
+    fn windows(&self, o: usize) -> Vec<[f64; 2]> {
+        let output = &self.plan.outputs[o];
+        let (lo, hi) = output.spec.dtype.range();
+        let window = if output.openness && output.spec.dtype.is_float() {
+            [0.0, 1.0]
+        } else if output.spec.dtype.is_float() {
+            [0.0, 1.0]
+        } else {
+            [lo, hi]
+        };
+        vec![window; output.spec.components.unwrap_or(1)]
+    }
+
+    fn report(&self) -> Report {
+        let mut report = Report::default();
+        self.metrics.fill(&mut report, self.plan.voxels());
+        report.bricks.total = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
+        report.memory_budget_bytes = self.plan.memory;
+        for (s, step) in self.plan.graph.steps.iter().enumerate() {
+            let (seconds, voxels) = self.metrics.step_totals(s);
+            report.stages.push(StageReport { name: step.stages.join("+"), seconds, device: "cpu".into(), voxels });
+        }
+        report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();
+        report
+    }
+
+    /// Wall time since the run was opened.
+    pub fn elapsed(&self) -> Duration {
+        Duration::from_secs_f64(self.metrics.seconds())
+    }
+}
+
+impl Drop for Session<'_> {
+    fn drop(&mut self) {
+        if let Some(dir) = &self.scratch {
+            let _ = std::fs::remove_dir_all(dir);
+        }
+    }
+}

@@ -1,0 +1,492 @@
+//! Runs one step of the graph on one brick: cuts what the kernel may see, applies the border rule and the mask.
+
+use std::collections::HashMap;
+
+use super::value::{Comp, Value};
+use crate::brick::{Pool, Scratch, Voxels, gather};
+use crate::config::WhereRule;
+use crate::grid::{Affine, AnyView, AnyViewMut, Border, Region, Shape, View, ViewMut, Voxel};
+use crate::kernel::obscurance::{ObscuranceIo, Prepared};
+use crate::kernel::simd::Level;
+use crate::kernel::window::WindowOut;
+use crate::kernel::{Context, gaussian, gradient, mask, pointwise, rank, window};
+use crate::plan::Plan;
+use crate::plan::graph::{GradientChannel, Mask, Moment, ObscuranceChannel, Step, StepId, StepKind, TransferChannel, Wire};
+use crate::stage::WindowParams;
+
+/// What all bricks of a run share.
+pub struct Engine<'a> {
+    pub plan: &'a Plan,
+    pub level: Level,
+    pub sweeps: HashMap<StepId, Prepared>,
+    /// Results of the pre-passes so far.
+    pub globals: Vec<[f64; 2]>,
+    /// Constants are propagated instead of computed.
+    pub skip: bool,
+    pub pool: &'a Pool,
+}
+
+/// A mask over a step's output box: 1 = needed.
+#[derive(Debug)]
+pub enum MaskValue {
+    All,
+    None,
+    Some(Vec<u8>),
+}
+
+impl<'a> Engine<'a> {
+    pub fn new(plan: &'a Plan, pool: &'a Pool, skip: bool) -> Engine<'a> {
+        let sweeps = (plan.graph.steps.iter().enumerate())
+            .filter_map(|(i, s)| match &s.kind {
+                StepKind::Obscurance { params, .. } => Some((i, Prepared::new(params))),
+                _ => None,
+            })
+            .collect();
+        Engine { plan, level: Level::detect(), sweeps, globals: Vec::new(), skip, pool }
+    }
+
+    /// The mask of a step over `region`, from its wire's value.
+    pub fn mask(&self, mask: &Mask, value: &mut Value, region: Region, volume: Region) -> MaskValue {
+        value.materialize(self.pool);
+        let wire = &self.plan.graph.wires[mask.wire];
+        let mut needed = vec![0u8; region.voxels()];
+        let dst = ViewMut::dense(&mut needed, region.shape());
+        match &mask.rule {
+            WhereRule::Range { min, max } => {
+                mask::range(value.view(0, region), wire.affine, wire.missing, *min, *max, dst);
+            }
+            WhereRule::Iso { iso, band } => {
+                let src_box = region.grow(mask.reach).clip(&volume);
+                let spacing = self.plan.graph.lattices[wire.lattice].spacing;
+                mask::iso_band(
+                    value.view(0, src_box),
+                    src_box,
+                    wire.affine,
+                    wire.missing,
+                    iso,
+                    *band,
+                    spacing,
+                    dst,
+                    region,
+                );
+            }
+        }
+        let count = needed.iter().map(|&n| n as usize).sum::<usize>();
+        match count {
+            0 => MaskValue::None,
+            n if n == needed.len() => MaskValue::All,
+            _ => MaskValue::Some(needed),
+        }
+    }
+
+    /// Outputs of a step that no voxel needs.
+    pub fn filled(&self, step: &Step, region: Region) -> Vec<Value> {
+        let wires = step.outputs.iter().map(|&w| &self.plan.graph.wires[w]);
+        wires.map(|w| Value::constant(w.dtype, region, w.components, w.fill)).collect()
+    }
+
+    /// Computes a step on `region`; `values` holds its inputs, each covering what it needs.
+    pub fn run(
+        &self,
+        id: StepId,
+        values: &mut [Option<Value>],
+        mask: &MaskValue,
+        region: Region,
+        volume: Region,
+        scratch: &mut Scratch,
+    ) -> Vec<Value> {
+        let step = &self.plan.graph.steps[id];
+        if let MaskValue::None = mask {
+            return self.filled(step, region);
+        }
+        if self.skip
+            && matches!(mask, MaskValue::All)
+            && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)
+        {
+            return values;
+        }
+        for &w in &step.inputs {
+            if let Some(value) = &mut values[w] {
+                value.materialize(self.pool);
+            }
+        }
+        let mut outputs = self.compute(id, &inputs_of(step, values), region, volume, scratch);
+        if let MaskValue::Some(needed) = mask {
+            for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
+                let fill = self.plan.graph.wires[w].fill;
+                value.comps.iter_mut().for_each(|c| fill_where(c, needed, fill));
+            }
+        }
+        outputs
+    }
+
+    /// A step of constants is the same step on one voxel: the kernel itself says what comes out.
+    fn constant(
+        &self,
+        id: StepId,
+        inputs: &[&Value],
+        region: Region,
+        volume: Region,
+        scratch: &mut Scratch,
+    ) -> Option<Vec<Value>> {
+        let step = &self.plan.graph.steps[id];
+        let constants = inputs.iter().map(|v| v.constants()).collect::<Option<Vec<_>>>()?;
+        if matches!(step.border, Border::Constant(_)) && !volume.contains(&region.grow(step.reach)) {
+            return None;
+        }
+        let one = Region::whole([1, 1, 1]);
+        let small: Vec<Value> = inputs
+            .iter()
+            .zip(constants)
+            .map(|(v, constants)| {
+                let comps = constants.into_iter().map(|c| {
+                    let mut voxel = Voxels::zeroed(v.dtype, 1);
+                    voxel.fill(c);
+                    Comp::Voxels(voxel)
+                });
+                Value { dtype: v.dtype, region: one, comps: comps.collect() }
+            })
+            .collect();
+        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), one, one, scratch);
+        let spread = |value: Value| {
+            let comps = value.comps.iter().map(|c| match c {
+                Comp::Const(v) => Comp::Const(*v),
+                Comp::Voxels(v) => Comp::Const(v.at(0)),
+            });
+            Value { dtype: value.dtype, region, comps: comps.collect() }
+        };
+        Some(outputs.into_iter().map(spread).collect())
+    }
+
+    fn compute(&self, id: StepId, inputs: &[&Value], region: Region, volume: Region, scratch: &mut Scratch) -> Vec<Value> {
+        let step = &self.plan.graph.steps[id];
+        let wires: Vec<&Wire> = step.outputs.iter().map(|&w| &self.plan.graph.wires[w]).collect();
+        let mut outputs: Vec<Value> = wires
+            .iter()
+            .map(|w| {
+                let buffer = || Comp::Voxels(self.pool.take(w.dtype, region.voxels()));
+                Value { dtype: w.dtype, region, comps: (0..w.components).map(|_| buffer()).collect() }
+            })
+            .collect();
+        let mut cx = Context { level: self.level, scratch };
+        let input_wire = &self.plan.graph.wires[step.inputs[0]];
+        match &step.kind {
+            StepKind::Obscurance { channels, colour, normal, .. } => {
+                let sweep = &self.sweeps[&id];
+                self.sweep(sweep, channels, colour.is_some(), normal.is_some(), inputs, &mut outputs, region, volume, &mut cx);
+            }
+            StepKind::Gradient { size, weight, spacing, channels } => {
+                let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
+                let mut out = gradient::GradientOut::default();
+                for (channel, value) in channels.iter().zip(&mut outputs) {
+                    let mut views = views_mut(value);
+                    match channel {
+                        GradientChannel::Magnitude => out.magnitude = views.pop(),
+                        GradientChannel::Vector => out.vector = Some(three(views)),
+                    }
+                }
+                let (affine, missing) = (src.affine, src.missing);
+                gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
+                src.recycle(self.pool);
+            }
+            StepKind::Window { .. } | StepKind::Rank { .. } | StepKind::Gaussian { .. } => {
+                for c in 0..input_wire.components {
+                    let src = self.windowed(step, inputs[0], c, input_wire, region, volume);
+                    self.windows(step, &src, &mut outputs, c, &mut cx);
+                    repair_missing(&wires, inputs[0], c, input_wire, &mut outputs, region);
+                    src.recycle(self.pool);
+                }
+            }
+            _ => self.pointwise(step, inputs, &mut outputs, region),
+        }
+        outputs
+    }
+
+    /// Window, rank or Gaussian of one component.
+    fn windows(&self, step: &Step, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) {
+        match &step.kind {
+            StepKind::Window { params, channels } => {
+                let params = WindowParams { missing: src.missing, ..*params };
+                let mut outs: Vec<WindowOut> = channels
+                    .iter()
+                    .zip(outputs)
+                    .map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, c) })
+                    .collect();
+                window::window(src.view(), &params, src.at, &mut outs, cx);
+            }
+            StepKind::Rank { params, shape, ties } => {
+                let params = WindowParams { missing: src.missing, ..*params };
+                rank::rank(src.view(), &params, *shape, *ties, src.at, view_mut(&mut outputs[0], c), cx);
+            }
+            StepKind::Gaussian { sigma, channels } => {
+                let (mut mean, mut variance) = (None, None);
+                for (channel, value) in channels.iter().zip(outputs) {
+                    match channel {
+                        Moment::Mean => mean = Some(view_mut(value, c)),
+                        Moment::Variance => variance = Some(view_mut(value, c)),
+                    }
+                }
+                gaussian::gaussian(src.view(), *sigma, src.affine, src.missing, src.at, mean, variance, cx);
+            }
+            _ => unreachable!("only window kernels come here"),
+        }
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn sweep(
+        &self,
+        sweep: &Prepared,
+        channels: &[ObscuranceChannel],
+        has_colour: bool,
+        has_normal: bool,
+        inputs: &[&Value],
+        outputs: &mut [Value],
+        region: Region,
+        volume: Region,
+        cx: &mut Context,
+    ) {
+        let src_box = region.grow(sweep.reach()).clip(&volume);
+        // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
+        let colour = has_colour.then(|| std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(inputs[1].view(c, src_box))));
+        let colour = colour.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], src_box.shape())));
+        let normal = has_normal.then(|| {
+            let value = inputs[1 + usize::from(has_colour)];
+            std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
+        });
+        let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
+        let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
+        for (channel, value) in channels.iter().zip(outputs) {
+            let mut views = views_mut(value);
+            match channel {
+                ObscuranceChannel::Openness => io.openness = views.pop(),
+                ObscuranceChannel::Rgb => io.rgb = Some(three(views)),
+            }
+        }
+        sweep.sweep(inputs[0].view(0, src_box), src_box, region, io, cx);
+    }
+
+    fn pointwise(&self, step: &Step, inputs: &[&Value], outputs: &mut [Value], region: Region) {
+        let wire = |i: usize| &self.plan.graph.wires[step.inputs[i]];
+        let affine = |i: usize| (wire(i).affine, wire(i).missing);
+        // A component of an input: the same one, or the only one.
+        let part = |i: usize, c: usize| inputs[i].view(c.min(inputs[i].comps.len() - 1), region);
+        match &step.kind {
+            StepKind::Transfer { points, channels } => {
+                let (mut opacity, mut rgb) = (None, None);
+                for (channel, value) in channels.iter().zip(outputs.iter_mut()) {
+                    let mut views = views_mut(value);
+                    match channel {
+                        TransferChannel::Opacity => opacity = Some(views.swap_remove(0)),
+                        TransferChannel::Rgb => rgb = Some(three(views)),
+                    }
+                }
+                let (a, missing) = affine(0);
+                pointwise::transfer(part(0, 0), a, missing, points, opacity, rgb);
+            }
+            kind => {
+                for c in 0..outputs[0].comps.len() {
+                    let dst = view_mut(&mut outputs[0], c);
+                    match kind {
+                        StepKind::OpennessWindow { low, high, mode } => {
+                            pointwise::openness_window(part(0, c), *low, *high, *mode, dst);
+                        }
+                        StepKind::ModulateByVariance { sigma_max2 } => {
+                            pointwise::modulate_by_variance(part(0, c), part(1, c), *sigma_max2, dst);
+                        }
+                        StepKind::ModulateBySaliency { threshold, gain } => {
+                            pointwise::modulate_by_saliency(part(0, c), part(1, c), *threshold, *gain, dst);
+                        }
+                        StepKind::AmbientLight { k } => pointwise::ambient_light(part(0, c), part(1, c), *k, dst),
+                        StepKind::Combine { kind } => {
+                            let parts: Vec<_> = (0..inputs.len())
+                                .map(|i| {
+                                    let (a, missing) = affine(i);
+                                    (part(i, c), a, missing)
+                                })
+                                .collect();
+                            pointwise::combine(&parts, *kind, dst);
+                        }
+                        StepKind::Divide { by } => {
+                            let max = Plan::global(&self.globals, *by)[1];
+                            let slope = if max > 0.0 && max.is_finite() { 1.0 / max } else { 1.0 };
+                            pointwise::scale(part(0, c), Affine { slope, intercept: 0.0 }, None, dst);
+                        }
+                        _ => unreachable!("window kernels do not come here"),
+                    }
+                }
+            }
+        }
+    }
+
+    /// The input of a window kernel: the box grown by the reach, clipped or extended by the border rule.
+    fn windowed<'v>(
+        &self,
+        step: &Step,
+        value: &'v Value,
+        comp: usize,
+        wire: &Wire,
+        region: Region,
+        volume: Region,
+    ) -> Windowed<'v> {
+        let wanted = region.grow(step.reach);
+        let inside = wanted.clip(&volume);
+        let whole = Windowed {
+            src: Src::Borrowed(value.view(comp, inside)),
+            at: inside.offset_of(&region),
+            affine: wire.affine,
+            missing: wire.missing,
+        };
+        if step.border == Border::Clip || wanted == inside {
+            return whole;
+        }
+        // What the rule reads lies in the value's box: clamped and mirrored indices stay within the reach of the edge.
+        let src = value.view(comp, value.region);
+        let (outside, promote) = wire.beyond(step.border);
+        let at = wanted.offset_of(&region);
+        let mut padded;
+        let (dtype, missing) = if promote { (wire.dtype.result(), None) } else { (wire.dtype, wire.missing) };
+        if promote {
+            let mut floats = self.pool.take(dtype, value.region.voxels());
+            pointwise::scale(src, Affine::IDENTITY, wire.missing, floats.view_mut(value.region.shape()));
+            padded = self.pool.take(dtype, wanted.voxels());
+            extend_any(floats.view(value.region.shape()), value.region, &mut padded, wanted, volume, step.border, outside);
+            self.pool.put(floats);
+        } else {
+            padded = self.pool.take(dtype, wanted.voxels());
+            extend_any(src, value.region, &mut padded, wanted, volume, step.border, outside);
+        }
+        Windowed { src: Src::Owned(padded, wanted.shape()), at, affine: wire.affine, missing }
+    }
+}
+
+/// A kernel's input with the place of the output box in it.
+struct Windowed<'a> {
+    src: Src<'a>,
+    at: [usize; 3],
+    affine: Affine,
+    missing: Option<i64>,
+}
+
+enum Src<'a> {
+    Borrowed(AnyView<'a>),
+    Owned(Voxels, Shape),
+}
+
+impl Windowed<'_> {
+    fn view(&self) -> AnyView<'_> {
+        match &self.src {
+            Src::Borrowed(v) => *v,
+            Src::Owned(v, shape) => v.view(*shape),
+        }
+    }
+
+    fn recycle(self, pool: &Pool) {
+        if let Src::Owned(v, _) = self.src {
+            pool.put(v);
+        }
+    }
+}
+
+/// A step's inputs, in its order. Panics if one has not been read or made.
+fn inputs_of<'v>(step: &Step, values: &'v [Option<Value>]) -> Vec<&'v Value> {
+    step.inputs.iter().map(|&w| values[w].as_ref().expect("inputs are made before their readers")).collect()
+}
+
+fn extend_any(src: AnyView, src_box: Region, dst: &mut Voxels, dst_box: Region, volume: Region, border: Border, outside: f64) {
+    macro_rules! arms {
+        ($($t:ident: $ty:ty),*) => {
+            match (src, dst.view_mut(dst_box.shape())) {
+                $((AnyView::$t(s), AnyViewMut::$t(d)) => {
+                    gather::extend(s, src_box, d, dst_box, volume, border, <$ty>::from_f64(outside))
+                })*
+                _ => unreachable!("a padded brick has its input's type"),
+            }
+        };
+    }
+    arms!(U8: u8, I8: i8, U16: u16, I16: i16, U32: u32, I32: i32, F32: f32, F64: f64)
+}
+
+fn fill_where(comp: &mut Comp, needed: &[u8], fill: f64) {
+    fn set<T: Voxel>(v: &mut [T], needed: &[u8], fill: f64) {
+        let fill = T::from_f64(fill);
+        for (v, n) in v.iter_mut().zip(needed) {
+            if *n == 0 {
+                *v = fill;
+            }
+        }
+    }
+    if let Comp::Voxels(voxels) = comp {
+        crate::with_voxels!(voxels, v => set(v, needed, fill));
+    }
+}
+
+/// Integer outputs (min, max) of a missing voxel hold the missing value, so that later stages see it as missing.
+fn repair_missing(wires: &[&Wire], input: &Value, comp: usize, input_wire: &Wire, outputs: &mut [Value], region: Region) {
+    let Some(missing) = input_wire.missing else { return };
+    for (wire, value) in wires.iter().zip(outputs) {
+        if wire.dtype.is_float() || wire.missing.is_none() {
+            continue;
+        }
+        let src = input.view(comp, region);
+        let [nz, ny, nx] = region.shape();
+        let Comp::Voxels(out) = &mut value.comps[comp] else { continue };
+        let mut i = 0;
+        for z in 0..nz {
+            for y in 0..ny {
+                for x in 0..nx {
+                    if src.at_f64([z, y, x]) == missing as f64 {
+                        set_at(out, i, missing as f64);
+                    }
+                    i += 1;
+                }
+            }
+        }
+    }
+}
+
+fn set_at(voxels: &mut Voxels, index: usize, value: f64) {
+    fn set<T: Voxel>(v: &mut [T], index: usize, value: f64) {
+        v[index] = T::from_f64(value);
+    }
+    crate::with_voxels!(voxels, v => set(v, index, value));
+}
+
+fn view_mut(value: &mut Value, comp: usize) -> AnyViewMut<'_> {
+    let shape = value.region.shape();
+    match &mut value.comps[comp] {
+        Comp::Voxels(v) => v.view_mut(shape),
+        Comp::Const(_) => unreachable!("outputs are allocated as voxels"),
+    }
+}
+
+fn views_mut(value: &mut Value) -> Vec<AnyViewMut<'_>> {
+    let shape = value.region.shape();
+    value
+        .comps
+        .iter_mut()
+        .map(|c| match c {
+            Comp::Voxels(v) => v.view_mut(shape),
+            Comp::Const(_) => unreachable!("outputs are allocated as voxels"),
+        })
+        .collect()
+}
+
+fn three(views: Vec<AnyViewMut<'_>>) -> [AnyViewMut<'_>; 3] {
+    match <[AnyViewMut<'_>; 3]>::try_from(views) {
+        Ok(three) => three,
+        Err(views) => panic!("{} components where 3 belong", views.len()),
+    }
+}
+
+fn narrow(view: AnyView) -> Vec<f32> {
+    fn run<T: Voxel>(v: View<T>) -> Vec<f32> {
+        let mut out = Vec::with_capacity(v.shape.iter().product());
+        for z in 0..v.shape[0] {
+            for y in 0..v.shape[1] {
+                out.extend(v.row_at(z, y).iter().map(|x| x.to_f64() as f32));
+            }
+        }
+        out
+    }
+    crate::with_view!(AnyView, view, v => run(v))
+}

@@ -1,0 +1,206 @@
+//! The pipeline: readers fill bricks in order, rayon workers compute them (one brick, one thread), writers store what
+//! comes out; bounded channels between, one gate for bytes, the first error stops the rest.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use super::budget::{Budget, Permit};
+use super::cancel::Cancel;
+use super::compute::{Finished, evaluate};
+use super::metrics::Metrics;
+use super::read::{Loaded, Reader};
+use super::trace::Trace;
+use crate::brick::Scratch;
+use crate::grid::Region;
+use crate::{Error, Result};
+
+/// One brick to do: its box and the caller's number for it (a task slot).
+#[derive(Debug, Clone, Copy)]
+pub struct Work {
+    pub brick: Region,
+    pub slot: usize,
+}
+
+/// What a stream of bricks needs.
+pub struct Stream<'a, W> {
+    pub reader: &'a Reader<'a>,
+    pub work: &'a [Work],
+    /// Bytes of one whole brick, and of all that may be alive.
+    pub brick_bytes: u64,
+    pub budget: u64,
+    pub brick_voxels: u64,
+    pub threads: usize,
+    pub pool: &'a rayon::ThreadPool,
+    pub metrics: &'a Metrics,
+    pub trace: &'a Trace,
+    pub cancel: &'a Cancel,
+    /// Turns a finished brick into what is to be written (called on workers).
+    pub deliver: &'a (dyn Fn(&Finished, Work, &mut Scratch) -> Result<W> + Sync),
+    /// Writes it (called on writers).
+    pub write: &'a (dyn Fn(Work, W) -> Result<()> + Sync),
+    /// Told after each brick.
+    pub tick: &'a (dyn Fn() + Sync),
+}
+
+/// The first error; later ones are consequences.
+#[derive(Default)]
+struct FirstError {
+    stop: AtomicBool,
+    error: Mutex<Option<Error>>,
+}
+
+impl FirstError {
+    fn set(&self, error: Error) {
+        self.error.lock().unwrap_or_else(|e| e.into_inner()).get_or_insert(error);
+        self.stop.store(true, Ordering::Release);
+    }
+
+    fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Acquire)
+    }
+}
+
+/// The next brick and its bytes, handed out in order.
+struct Queue<'a> {
+    next: Mutex<usize>,
+    work: &'a [Work],
+}
+
+impl<W: Send> Stream<'_, W> {
+    /// Runs every brick, or until the first error or a cancel; what was started is finished either way.
+    pub fn run(&self) -> Result<()> {
+        let readers = (self.threads / 2).max(1);
+        let first = FirstError::default();
+        let budget = Budget::new(self.budget);
+        let queue = Queue { next: Mutex::new(0), work: self.work };
+        let scratches: Vec<Mutex<Scratch>> = (0..self.threads).map(|_| Mutex::new(Scratch::new())).collect();
+        let (to_compute, ready) = crossbeam_channel::bounded::<(Work, Loaded, Permit)>(self.threads);
+        let (to_write, finished) = crossbeam_channel::bounded::<(Work, W, Permit)>(self.threads + 1);
+        std::thread::scope(|scope| {
+            for _ in 0..readers {
+                let to_compute = to_compute.clone();
+                scope.spawn(|| self.read_loop(&queue, &budget, &first, to_compute));
+            }
+            for _ in 0..2 {
+                let finished = finished.clone();
+                scope.spawn(|| self.write_loop(&first, finished));
+            }
+            drop((to_compute, finished));
+            let (first, scratches, to_write) = (&first, &scratches, to_write);
+            self.pool.in_place_scope(|workers| {
+                for (work, loaded, permit) in ready {
+                    let to_write = to_write.clone();
+                    workers.spawn(move |_| self.compute(work, loaded, permit, first, scratches, &to_write));
+                }
+            });
+        });
+        match first.error.into_inner().unwrap_or_else(|e| e.into_inner()) {
+            Some(error) => Err(error),
+            None => self.cancel.check(),
+        }
+    }
+
+    fn read_loop(
+        &self,
+        queue: &Queue,
+        budget: &Arc<Budget>,
+        first: &FirstError,
+        out: crossbeam_channel::Sender<(Work, Loaded, Permit)>,
+    ) {
+        loop {
+            // Bytes are taken under the lock, so that bricks start in order.
+            let mut next = queue.next.lock().unwrap_or_else(|e| e.into_inner());
+            let Some(&work) = queue.work.get(*next) else { return };
+            if first.stopped() || self.cancel.is_cancelled() {
+                return;
+            }
+            *next += 1;
+            let bytes = self.brick_bytes * work.brick.voxels() as u64 / self.brick_voxels.max(1);
+            // A brick cut by the volume's edge still has whole halos: count at least half.
+            let (permit, waited) = budget.acquire(bytes.max(self.brick_bytes / 2));
+            drop(next);
+            self.metrics.waited("budget", waited);
+            let start = Instant::now();
+            let read = guarded(|| self.reader.read(work.brick));
+            self.trace.span("read", start, &[("brick", format!("{:?}", work.brick))]);
+            match read {
+                Ok(loaded) => {
+                    let start = Instant::now();
+                    if out.send((work, loaded, permit)).is_err() {
+                        return;
+                    }
+                    self.metrics.waited("workers_busy", start.elapsed().as_secs_f64());
+                }
+                Err(error) => {
+                    first.set(error);
+                    return;
+                }
+            }
+        }
+    }
+
+    fn compute(
+        &self,
+        work: Work,
+        loaded: Loaded,
+        permit: Permit,
+        first: &FirstError,
+        scratches: &[Mutex<Scratch>],
+        out: &crossbeam_channel::Sender<(Work, W, Permit)>,
+    ) {
+        if first.stopped() {
+            return;
+        }
+        let worker = rayon::current_thread_index().unwrap_or(0);
+        let mut scratch = scratches[worker].lock().unwrap_or_else(|e| e.into_inner());
+        let result = guarded(|| {
+            let engine = self.reader.engine;
+            let done = evaluate(engine, self.reader.program, loaded, &mut scratch, self.metrics, self.trace);
+            let start = Instant::now();
+            let written = (self.deliver)(&done, work, &mut scratch);
+            self.metrics.encode_ns.fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);
+            self.trace.span("levels+encode", start, &[("brick", format!("{:?}", work.brick))]);
+            for value in done.values.into_iter().flatten() {
+                value.recycle(engine.pool);
+            }
+            written
+        });
+        drop(scratch);
+        match result {
+            Ok(written) => {
+                let start = Instant::now();
+                // Writers outlive the workers, so this fails only while stopping.
+                let _ = out.send((work, written, permit));
+                self.metrics.waited("writers_busy", start.elapsed().as_secs_f64());
+            }
+            Err(error) => first.set(error),
+        }
+    }
+
+    fn write_loop(&self, first: &FirstError, finished: crossbeam_channel::Receiver<(Work, W, Permit)>) {
+        for (work, written, permit) in finished {
+            if first.stopped() {
+                continue;
+            }
+            let start = Instant::now();
+            match guarded(|| (self.write)(work, written)) {
+                Ok(()) => self.metrics.brick_done(work.brick.voxels() as u64),
+                Err(error) => first.set(error),
+            }
+            self.trace.span("write", start, &[("brick", format!("{:?}", work.brick))]);
+            drop(permit);
+            self.metrics.sample_memory();
+            (self.tick)();
+        }
+    }
+}
+
+/// A bug in a kernel must end the run with an error, not take the process and its journal down.
+fn guarded<T>(f: impl FnOnce() -> Result<T>) -> Result<T> {
+    std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).unwrap_or_else(|cause| {
+        let text = cause.downcast_ref::<String>().cloned();
+        let text = text.or_else(|| cause.downcast_ref::<&str>().map(|s| s.to_string())).unwrap_or_default();
+        Err(Error::Failed(format!("internal error, please report it: {text}")))
+    })
+}

@@ -1,0 +1,136 @@
+//! Bytes of input files: memory maps whose length is checked again at each use, and positioned header reads.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use memmap2::{Mmap, UncheckedAdvice};
+
+use crate::brick::Voxels;
+use crate::{Error, Result};
+
+/// A whole file, mapped for reading.
+#[derive(Debug)]
+pub struct MappedFile {
+    path: PathBuf,
+    file: File,
+    map: Mmap,
+}
+
+impl MappedFile {
+    pub fn open(path: &Path) -> Result<MappedFile> {
+        let file = open_file(path)?;
+        MappedFile::of(path, file)
+    }
+
+    /// Maps an open file; `path` names it in errors.
+    pub fn of(path: &Path, file: File) -> Result<MappedFile> {
+        // SAFETY: the map is only ever read as bytes. Another process may change or shorten the file meanwhile: changed
+        // bytes are merely other voxels, and `bytes` asks for the length before each use, so that a shortened file
+        // becomes an error (one that shrinks in the very moment of a read is the one case left).
+        let map = unsafe { Mmap::map(&file) }.map_err(|e| Error::file(path, format!("cannot be mapped: {e}")))?;
+        Ok(MappedFile { path: path.to_path_buf(), file, map })
+    }
+
+    pub fn len(&self) -> u64 {
+        self.map.len() as u64
+    }
+
+    /// The bytes, after a check that the file still has all of them.
+    pub fn bytes(&self) -> Result<&[u8]> {
+        let now = self.file.metadata().map_err(|e| Error::file(&self.path, e))?.len();
+        if now < self.len() {
+            let was = self.len();
+            return Err(Error::file(&self.path, format!("shrank from {was} to {now} bytes while it was being read")));
+        }
+        Ok(&self.map)
+    }
+
+    /// Tells the system that the whole pages inside `start..end` will not be wanted soon.
+    pub fn forget(&self, start: u64, end: u64) {
+        const PAGE: u64 = 1 << 16; // a multiple of every page size in use
+        let (start, end) = (start.div_ceil(PAGE) * PAGE, end.min(self.len()) / PAGE * PAGE);
+        if end > start {
+            // SAFETY: the map is read-only and backed by its file, so dropped pages come back with the same bytes.
+            let _ = unsafe {
+                self.map.unchecked_advise_range(UncheckedAdvice::DontNeed, start as usize, (end - start) as usize)
+            };
+        }
+    }
+}
+
+/// Where the bytes of a lattice lie.
+#[derive(Debug)]
+pub enum Files {
+    /// A few files, mapped for as long as the source lives.
+    Held(Vec<MappedFile>),
+    /// Many files with their lengths: each is mapped while it is read, so that no limit on open files is met.
+    OnDemand(Vec<(PathBuf, u64)>),
+    /// An array in memory, in this machine's byte order.
+    Memory(Voxels),
+}
+
+impl Files {
+    /// Runs `f` on the bytes of file `index`.
+    pub fn with_bytes<R>(&self, index: usize, f: impl FnOnce(&[u8]) -> Result<R>) -> Result<R> {
+        match self {
+            Files::Held(files) => f(files[index].bytes()?),
+            Files::Memory(voxels) => f(voxels.as_bytes()),
+            Files::OnDemand(files) => {
+                let (path, len) = &files[index];
+                let mapped = MappedFile::open(path)?;
+                if mapped.len() != *len {
+                    let now = mapped.len();
+                    return Err(Error::file(
+                        path,
+                        format!("changed from {len} to {now} bytes while it was being read"),
+                    ));
+                }
+                f(mapped.bytes()?)
+            }
+        }
+    }
+}
+
+/// Opens a file for reading; the error names it.
+pub fn open_file(path: &Path) -> Result<File> {
+    let file = File::open(path).map_err(|e| match e.kind() {
+        std::io::ErrorKind::NotFound => Error::file(path, "no such file"),
+        _ => Error::file(path, format!("cannot be opened: {e}")),
+    })?;
+    let meta = file.metadata().map_err(|e| Error::file(path, e))?;
+    if meta.is_dir() {
+        return Err(Error::file(path, "is a folder; a file is expected here"));
+    }
+    Ok(file)
+}
+
+/// Bytes of a file.
+pub fn file_len(path: &Path) -> Result<u64> {
+    Ok(open_file(path)?.metadata().map_err(|e| Error::file(path, e))?.len())
+}
+
+/// Up to `most` bytes from the start of `reader`.
+pub fn head(path: &Path, reader: &mut dyn Read, most: usize) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    reader.take(most as u64).read_to_end(&mut bytes).map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
+    Ok(bytes)
+}
+
+/// Up to `most` bytes from the start of a file.
+pub fn file_head(path: &Path, most: usize) -> Result<Vec<u8>> {
+    head(path, &mut open_file(path)?, most)
+}
+
+/// Bytes free for this user on the disk of `folder`; `None` where the system cannot say.
+pub fn free_bytes(folder: &Path) -> Option<u64> {
+    use std::os::unix::ffi::OsStrExt;
+    let path = std::ffi::CString::new(folder.as_os_str().as_bytes()).ok()?;
+    // SAFETY: `statvfs` is plain numbers, for which all zeros is a value; the path is NUL-terminated and the struct
+    // outlives the call.
+    let (code, stat) = unsafe {
+        let mut stat: libc::statvfs = std::mem::zeroed();
+        (libc::statvfs(path.as_ptr(), &mut stat), stat)
+    };
+    (code == 0).then(|| (stat.f_bavail as u64).saturating_mul(stat.f_frsize as u64))
+}

@@ -1,0 +1,333 @@
+//! TIFF stacks: many pages in one file, or a folder of slices in natural order.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+use tiff::decoder::{Decoder, Limits};
+use tiff::tags::Tag;
+
+use super::bytes;
+use super::lattice::{Lattice, Planes};
+use super::planar::{Parsed, Pending, components, shape_of};
+use super::raw::refuse;
+use super::reblock::Reblock;
+use super::tiff_text::{Described, Order, describe};
+use crate::config::Input;
+use crate::grid::DType;
+use crate::store::VolumeInfo;
+use crate::{Error, Result};
+
+/// Pages of a stack beyond this are a broken file.
+const MOST_PAGES: usize = 1 << 22;
+/// Longest strip or tile that is decoded, in bytes.
+pub const MOST_CHUNK: usize = 1 << 30;
+
+pub type Reader = Decoder<BufReader<File>>;
+
+/// Opens a TIFF file at its first page.
+pub fn reader(path: &Path) -> Result<Reader> {
+    let file = BufReader::new(bytes::open_file(path)?);
+    let mut limits = Limits::default();
+    limits.decoding_buffer_size = MOST_CHUNK;
+    limits.intermediate_buffer_size = MOST_CHUNK;
+    Ok(Decoder::new(file).map_err(|e| broken(path, 0, e))?.with_limits(limits))
+}
+
+pub fn broken(path: &Path, page: usize, e: impl std::fmt::Display) -> Error {
+    Error::file(path, format!("TIFF page {page} cannot be read: {e}"))
+}
+
+/// One page that holds a plane.
+#[derive(Debug, Clone, PartialEq)]
+struct Page {
+    file: u32,
+    /// Index of the image in its file.
+    image: u32,
+    form: Form,
+    /// First byte of the voxels where they lie uncompressed and in one piece.
+    plain: Option<u64>,
+}
+
+/// What all pages of a stack must share.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Form {
+    width: u32,
+    height: u32,
+    dtype: DType,
+    big_endian: bool,
+    white_is_zero: bool,
+    compression: u16,
+}
+
+fn dtype(path: &Path, bits: u64, format: u64) -> Result<DType> {
+    Ok(match (format, bits) {
+        (1 | 4, 8) => DType::U8,
+        (1 | 4, 16) => DType::U16,
+        (1 | 4, 32) => DType::U32,
+        (2, 8) => DType::I8,
+        (2, 16) => DType::I16,
+        (2, 32) => DType::I32,
+        (3, 32) => DType::F32,
+        (3, 64) => DType::F64,
+        _ => {
+            let name = match (format, bits) {
+                (1 | 4, 1) => "bool (1 bit)".to_string(),
+                (1 | 4, n) => format!("u{n}"),
+                (2, n) => format!("i{n}"),
+                (3, n) => format!("f{n}"),
+                (5 | 6, _) => "complex".to_string(),
+                (f, n) => format!("of {n} bits, sample format {f}"),
+            };
+            return Err(refuse(path, &name));
+        }
+    })
+}
+
+/// Facts of the page where `decoder` stands; `None` for thumbnails and masks.
+fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize) -> Result<Option<Page>> {
+    let fail = |e: tiff::TiffError| broken(path, image, e);
+    let mut number =
+        |tag: Tag, or: u64| -> Result<u64> { Ok(decoder.find_tag_unsigned::<u64>(tag).map_err(fail)?.unwrap_or(or)) };
+    if number(Tag::NewSubfileType, 0)? & 0b101 != 0 {
+        return Ok(None);
+    }
+    let compression = number(Tag::Compression, 1)?;
+    let predictor = number(Tag::Predictor, 1)?;
+    let photometric = number(Tag::PhotometricInterpretation, 1)?;
+    let samples = number(Tag::SamplesPerPixel, 1)?;
+    if samples != 1 {
+        let name = match photometric {
+            2 if samples == 4 => "RGBA".to_string(),
+            2 => "RGB".to_string(),
+            6 => "YCbCr".to_string(),
+            _ => format!("of {samples} samples per pixel"),
+        };
+        return Err(refuse(path, &name));
+    }
+    if !matches!(photometric, 0 | 1 | 3) {
+        return Err(broken(
+            path,
+            image,
+            format!("photometric interpretation {photometric}; only grey values are read"),
+        ));
+    }
+    let first = |list: Option<Vec<u64>>, or: u64| list.and_then(|l| l.first().copied()).unwrap_or(or);
+    let bits = first(decoder.find_tag_unsigned_vec(Tag::BitsPerSample).map_err(fail)?, 1);
+    let format = first(decoder.find_tag_unsigned_vec(Tag::SampleFormat).map_err(fail)?, 1);
+    let dtype = dtype(path, bits, format)?;
+    let (width, height) = decoder.dimensions().map_err(fail)?;
+    let form = Form {
+        width,
+        height,
+        dtype,
+        big_endian: decoder.byte_order() == tiff::tags::ByteOrder::BigEndian,
+        white_is_zero: photometric == 0,
+        compression: compression as u16,
+    };
+    let mut plain = None;
+    let tiled = decoder.find_tag(Tag::TileWidth).map_err(fail)?.is_some();
+    if compression == 1 && predictor == 1 && !tiled {
+        let offsets: Vec<u64> = decoder.find_tag_unsigned_vec(Tag::StripOffsets).map_err(fail)?.unwrap_or_default();
+        let rows = decoder.find_tag_unsigned::<u64>(Tag::RowsPerStrip).map_err(fail)?.unwrap_or(height as u64);
+        let strip = (rows.min(height as u64).max(1) * width as u64).saturating_mul(dtype.size() as u64);
+        let whole = (height as u64).div_ceil(rows.clamp(1, height.max(1) as u64)) == offsets.len() as u64;
+        let follows = |w: &[u64]| w[0].checked_add(strip) == Some(w[1]);
+        plain = offsets.first().copied().filter(|_| whole && offsets.windows(2).all(follows));
+    } else if photometric == 3 {
+        return Err(refuse(path, "palette, compressed"));
+    }
+    Ok(Some(Page { file, image: image as u32, form, plain }))
+}
+
+/// All pages of a file, and the description of its first.
+fn pages(path: &Path, file: u32) -> Result<(Vec<Page>, Described)> {
+    let mut decoder = reader(path)?;
+    let text = decoder.find_tag(Tag::ImageDescription).ok().flatten().and_then(|v| v.into_string().ok());
+    let mut ratio = |tag: Tag| decoder.find_tag(tag).ok().flatten().and_then(per_unit);
+    let resolution = [ratio(Tag::YResolution), ratio(Tag::XResolution)];
+    let described = describe(path, text.as_deref().unwrap_or(""), resolution)?;
+    let mut pages = Vec::new();
+    for image in 0.. {
+        if image > 0 {
+            if !decoder.more_images() {
+                break;
+            }
+            decoder.next_image().map_err(|e| broken(path, image, e))?;
+        }
+        if image >= MOST_PAGES {
+            return Err(Error::file(path, format!("the TIFF has more than {MOST_PAGES} pages")));
+        }
+        pages.extend(page(path, &mut decoder, file, image)?);
+    }
+    Ok((pages, described))
+}
+
+/// Pixels per unit of a resolution tag.
+fn per_unit(value: tiff::decoder::ifd::Value) -> Option<f64> {
+    use tiff::decoder::ifd::Value;
+    match value {
+        Value::Rational(a, b) => Some(a as f64 / b as f64),
+        Value::List(list) => per_unit(list.into_iter().next()?),
+        Value::Float(v) => Some(v as f64),
+        Value::Double(v) => Some(v),
+        _ => None,
+    }
+}
+
+/// Order in which people number files: runs of digits by value, the rest by letter.
+pub fn natural_cmp(a: &str, b: &str) -> std::cmp::Ordering {
+    use std::cmp::Ordering::Equal;
+    let (mut a, mut b) = (a.as_bytes(), b.as_bytes());
+    let digits = |s: &[u8]| s.iter().take_while(|c| c.is_ascii_digit()).count();
+    loop {
+        let (m, n) = (digits(a), digits(b));
+        if m > 0 && n > 0 {
+            let trim = |s: &[u8]| s.iter().take_while(|c| **c == b'0').count();
+            let (x, y) = (&a[trim(&a[..m])..m], &b[trim(&b[..n])..n]);
+            let order = x.len().cmp(&y.len()).then_with(|| x.cmp(y));
+            if order != Equal {
+                return order;
+            }
+            (a, b) = (&a[m..], &b[n..]);
+            continue;
+        }
+        match (a.first(), b.first()) {
+            (None, None) => return Equal,
+            (x, y) if x == y => (a, b) = (&a[1..], &b[1..]),
+            (x, y) => return x.cmp(&y),
+        }
+    }
+}
+
+/// The TIFF files of a folder, in natural order.
+fn slices(folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(|e| Error::file(folder, e))? {
+        let path = entry.map_err(|e| Error::file(folder, e))?.path();
+        let tiff = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("tif") || e.eq_ignore_ascii_case("tiff"));
+        if tiff && !path.is_dir() {
+            found.push(path);
+        }
+    }
+    let name = |p: &PathBuf| p.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    found.sort_by(|a, b| natural_cmp(&name(a), &name(b)).then_with(|| a.cmp(b)));
+    if found.is_empty() {
+        return Err(Error::file(
+            folder,
+            "the folder is neither a Zarr array or group nor does it hold .tif or .tiff slices",
+        ));
+    }
+    Ok(found)
+}
+
+/// Opens one TIFF file or a folder of slices.
+pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
+    let files = if path.is_dir() { slices(path)? } else { vec![path.to_path_buf()] };
+    let (mut all, described) = pages(&files[0], 0)?;
+    let several = files.len() > 1;
+    for (i, file) in files.iter().enumerate().skip(1) {
+        all.extend(pages(file, i as u32)?.0);
+    }
+    let name = |p: &Page| format!("page {} of {}", p.image, files[p.file as usize].display());
+    let first = all.first().cloned().ok_or_else(|| Error::file(path, "the TIFF has no page with voxels"))?;
+    if several && all.len() != files.len() {
+        return Err(Error::file(
+            path,
+            format!("{} slices hold {} pages; a folder of slices needs one page per file", files.len(), all.len()),
+        ));
+    }
+    if let Some(odd) = all.iter().find(|p| p.form != first.form) {
+        let text = format!("{} ({:?}) differs from the first page ({:?})", name(odd), odd.form, first.form);
+        return Err(Error::file(path, text));
+    }
+    let form = first.form;
+    let plane_bytes = (form.width as u64 * form.height as u64).saturating_mul(form.dtype.size() as u64);
+    // ImageJ stores large stacks as one page, the other planes following without pages of their own.
+    if let (1, Some(planes), Some(start)) = (all.len(), described.planes, first.plain)
+        && planes > 1
+    {
+        let have = bytes::file_len(path)?;
+        if start.saturating_add(plane_bytes.saturating_mul(planes)) > have {
+            return Err(Error::file(
+                path,
+                format!("the description promises {planes} images, which {have} bytes cannot hold"),
+            ));
+        }
+        all = (0..planes).map(|k| Page { plain: Some(start + k * plane_bytes), ..first.clone() }).collect();
+    }
+    let described = if several { Described { order: Order::stack(all.len()), ..described } } else { described };
+    place(input, path, files, all, described, form)
+}
+
+fn place(
+    input: &Input,
+    path: &Path,
+    files: Vec<PathBuf>,
+    pages: Vec<Page>,
+    described: Described,
+    form: Form,
+) -> Result<Parsed> {
+    let order = described.order.fit(path, pages.len())?;
+    let shape = shape_of(path, [order.z as u64, form.height as u64, form.width as u64], form.dtype.size())?;
+    let (pairs, names) = components(input, order.t, order.c, &described.labels)?;
+    let picked: Vec<&Page> = pairs
+        .iter()
+        .flat_map(|(t, c)| (0..order.z).map(|z| (*t, *c, z)))
+        .map(|(t, c, z)| order.index(z, c, t).and_then(|i| pages.get(i)))
+        .collect::<Option<_>>()
+        .ok_or_else(|| Error::file(path, "the OME description names planes that the TIFF does not have"))?;
+    let folder = if files.len() > 1 { " folder" } else { "" };
+    let kind = if form.compression == 1 { "uncompressed".to_string() } else { compression_name(form.compression) };
+    let mut info = VolumeInfo::plain(shape, form.dtype, format!("TIFF{folder}, {kind}"));
+    (info.components, info.component_names) = (pairs.len(), names);
+    info.spacing = described.spacing;
+    info.unit = described.unit;
+    let header = format!("{form:?} {order:?} {pairs:?}").into_bytes();
+    let overflow = || Error::file(path, "the TIFF's sizes overflow");
+    if picked.iter().all(|p| p.plain.is_some()) {
+        let mut lattice = Lattice::dense(shape, form.dtype, form.big_endian, 0).ok_or_else(overflow)?;
+        lattice.planes = Planes::Table(picked.iter().map(|p| (p.file, p.plain.unwrap_or(0))).collect());
+        return Ok(Parsed { info, lattice, files, pending: Pending::Nothing, header, exact: false });
+    }
+    let one = shape.iter().product::<usize>() as u64 * form.dtype.size() as u64;
+    let mut lattice = Lattice::dense(shape, form.dtype, cfg!(target_endian = "big"), 0).ok_or_else(overflow)?;
+    if let Planes::Even { bases, .. } = &mut lattice.planes {
+        *bases = (0..pairs.len() as u64).map(|c| c.checked_mul(one)).collect::<Option<_>>().ok_or_else(overflow)?;
+    }
+    lattice.end(0).ok_or_else(overflow)?;
+    if form.white_is_zero && !matches!(form.dtype, DType::U8 | DType::U16 | DType::U32) {
+        return Err(refuse(path, &format!("{} with white as zero, compressed or tiled", form.dtype)));
+    }
+    let reblock = Reblock {
+        pages: picked.iter().map(|p| (p.file, p.image)).collect(),
+        width: form.width as usize,
+        height: form.height as usize,
+        dtype: form.dtype,
+        invert: form.white_is_zero,
+    };
+    Ok(Parsed { info, lattice, files, pending: Pending::Reblock(reblock), header, exact: false })
+}
+
+fn compression_name(code: u16) -> String {
+    match code {
+        5 => "LZW".to_string(),
+        7 => "JPEG".to_string(),
+        8 | 32946 => "Deflate".to_string(),
+        32773 => "PackBits".to_string(),
+        50000 => "zstd".to_string(),
+        other => format!("compression {other}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::natural_cmp;
+
+    #[test]
+    fn slices_sort_as_people_number_them() {
+        let mut names = ["s10.tif", "s9.tif", "s1.tif", "s010.tif", "s2b.tif", "s2.tif", "r99.tif"];
+        names.sort_by(|a, b| natural_cmp(a, b).then(a.cmp(b)));
+        assert_eq!(names, ["r99.tif", "s1.tif", "s2.tif", "s2b.tif", "s9.tif", "s010.tif", "s10.tif"]);
+    }
+}

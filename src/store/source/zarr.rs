@@ -1,0 +1,383 @@
+//! Zarr arrays, v2 and v3, alone or in OME-Zarr groups: read inner chunk by inner chunk.
+
+use std::borrow::Cow;
+use std::fs::File;
+use std::num::NonZeroU64;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use zarrs::array::codec::CodecChain;
+use zarrs::array::{Array, ArrayBytes, ArrayToBytesCodecTraits, CodecOptions};
+use zarrs::filesystem::FilesystemStore;
+
+use super::ChunkRead;
+use super::planar::key;
+use super::planar::{components, shape_of};
+use super::shards::{Shard, Shards};
+use super::zarr_meta::{self, ArrayMeta, Multiscale};
+use crate::brick::Voxels;
+use crate::config::Input;
+use crate::grid::{Region, Voxel};
+use crate::store::VolumeInfo;
+use crate::{Error, Result, with_dtype};
+
+/// An open Zarr array.
+pub struct ZarrArray {
+    folder: PathBuf,
+    pub meta: ArrayMeta,
+    array: Array<FilesystemStore>,
+    /// Codecs of an inner chunk.
+    codecs: Arc<CodecChain>,
+    inner: Vec<NonZeroU64>,
+    fill: f64,
+    shards: Shards,
+    /// Axes before the space axes, and each component's index along them.
+    lead: usize,
+    components: Vec<Vec<u64>>,
+    /// Chunks of the volume along z, y, x.
+    grid: [i64; 3],
+    options: CodecOptions,
+}
+
+impl std::fmt::Debug for ZarrArray {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ZarrArray").field("folder", &self.folder).field("meta", &self.meta).finish_non_exhaustive()
+    }
+}
+
+/// What an axis before the space axes is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Lead {
+    Time,
+    Channel,
+    Single,
+}
+
+/// Finds the array that the input means: the folder itself, its array `name`, or the level of its multiscales.
+fn find(input: &Input, folder: &Path) -> Result<(PathBuf, ArrayMeta, Option<Multiscale>)> {
+    let mut folder = folder.to_path_buf();
+    let mut listed = None;
+    if let Some(name) = &input.array {
+        let child = zarr_meta::inside(&folder, name).map_err(|_| {
+            Error::config(key(input, "array"), format!("`{name}` is no name of an array inside {}", folder.display()))
+        })?;
+        if zarr_meta::array(&child)?.is_none() && zarr_meta::group(&child)?.is_none() {
+            let have = zarr_meta::children(&folder).join(", ");
+            let text = format!("`{name}` is not in {}; it has: {have}", folder.display());
+            return Err(Error::config(key(input, "array"), text));
+        }
+        listed = zarr_meta::group(&folder)?
+            .and_then(|(attributes, _)| zarr_meta::named(&attributes, name.trim_matches('/')));
+        folder = child;
+    }
+    if let Some(meta) = zarr_meta::array(&folder)? {
+        if input.level != 0 {
+            let text =
+                format!("{}: {} is one array without levels; give the group's path", input.level, folder.display());
+            return Err(Error::config(key(input, "level"), text));
+        }
+        if let (None, Some(parent), Some(name)) = (&listed, folder.parent(), folder.file_name()) {
+            let group = zarr_meta::group(parent).ok().flatten();
+            listed = group.and_then(|(attributes, _)| zarr_meta::named(&attributes, &name.to_string_lossy()));
+        }
+        return Ok((folder, meta, listed));
+    }
+    let Some((attributes, _)) = zarr_meta::group(&folder)? else {
+        return Err(Error::file(&folder, "neither a Zarr array nor a Zarr group"));
+    };
+    let Some((path, multiscale)) = zarr_meta::dataset(input, &folder, &attributes)? else {
+        let have = zarr_meta::children(&folder).join(", ");
+        return Err(Error::file(
+            &folder,
+            format!("a Zarr group without multiscales; name an array in it with array = \"..\" (it has: {have})"),
+        ));
+    };
+    match zarr_meta::array(&path)? {
+        Some(meta) => Ok((path, meta, Some(multiscale))),
+        None => Err(Error::file(&path, "the multiscales name this array, but it does not exist")),
+    }
+}
+
+/// What the leading axes are, by name or by place (t, c before z, y, x).
+fn lead_axes(path: &Path, meta: &ArrayMeta, multiscale: Option<&Multiscale>) -> Result<Vec<Lead>> {
+    let n = meta.shape.len();
+    let axes = multiscale.map_or(&[][..], |m| &m.axes);
+    if !axes.is_empty() && axes.len() != n {
+        return Err(Error::file(path, format!("the multiscales have {} axes, the array {n}", axes.len())));
+    }
+    let kind = |a: usize| -> Option<&str> {
+        let (name, kind) = match axes.get(a) {
+            Some((name, kind, _)) => (Some(name.as_str()), kind.as_deref()),
+            None => (meta.names[a].as_deref(), None),
+        };
+        match (kind, name) {
+            (Some(k @ ("time" | "channel" | "space")), _) => Some(k),
+            (_, Some("t" | "time")) => Some("time"),
+            (_, Some("c" | "ch" | "channel" | "channels")) => Some("channel"),
+            (_, Some("z" | "y" | "x")) => Some("space"),
+            _ => None,
+        }
+    };
+    let kinds: Vec<_> = (0..n).map(kind).collect();
+    let named = kinds.iter().rposition(|k| matches!(k, Some("time" | "channel"))).map(|a| a + 1);
+    let lead = named.unwrap_or(0).max(n.saturating_sub(3));
+    if lead >= n || kinds[..lead].contains(&Some("space")) {
+        let text = format!(
+            "axes {kinds:?}: time and channel are read only where they come before the space axes, of which there may be three"
+        );
+        return Err(Error::file(path, text));
+    }
+    let mut out = Vec::new();
+    for a in 0..lead {
+        out.push(match kinds[a] {
+            _ if meta.shape[a] == 1 && kinds[a].is_none() => Lead::Single,
+            Some("time") => Lead::Time,
+            Some("channel") => Lead::Channel,
+            // Unnamed: c next to space, t before it.
+            _ if a + 1 == lead => Lead::Channel,
+            _ if a + 2 == lead => Lead::Time,
+            _ => return Err(Error::file(path, format!("shape {:?} has more axes than t, c, z, y, x", meta.shape))),
+        });
+    }
+    for kind in [Lead::Time, Lead::Channel] {
+        if out.iter().zip(&meta.shape).filter(|(l, n)| **l == kind && **n > 1).count() > 1 {
+            return Err(Error::file(path, format!("shape {:?} has two {kind:?} axes", meta.shape)));
+        }
+    }
+    Ok(out)
+}
+
+/// Spacing, origin and unit of the space axes.
+fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut VolumeInfo) -> Result<()> {
+    let mut unit: Option<Option<String>> = None;
+    for a in lead..n {
+        let i = 3 - (n - a);
+        info.spacing[i] = m.scale.get(a).copied().unwrap_or(1.0);
+        info.origin[i] = m.translation.get(a).copied().unwrap_or(0.0);
+        if info.shape[i] == 1 && !(info.spacing[i] > 0.0) {
+            info.spacing[i] = 1.0;
+        }
+        let own = m.axes.get(a).and_then(|axis| axis.2.clone());
+        if unit.as_ref().is_some_and(|u| *u != own) {
+            return Err(Error::file(
+                path,
+                format!("the space axes have different units ({unit:?}, {own:?}); one is expected"),
+            ));
+        }
+        unit = Some(own);
+    }
+    info.unit = unit.flatten();
+    Ok(())
+}
+
+/// Opens a Zarr array or an OME-Zarr image.
+pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
+    let (folder, meta, multiscale) = find(input, path)?;
+    let kinds = lead_axes(&folder, &meta, multiscale.as_ref())?;
+    let (lead, n) = (kinds.len(), meta.shape.len());
+    let tail = |list: &[u64]| -> [u64; 3] {
+        let mut zyx = [1; 3];
+        zyx[3 - (n - lead)..].copy_from_slice(&list[lead..]);
+        zyx
+    };
+    let shape = shape_of(&folder, tail(&meta.shape), meta.dtype.size())?;
+    let chunk = tail(&meta.inner).map(|n| n as usize);
+    let count =
+        |kind: Lead| kinds.iter().zip(&meta.shape).filter(|(k, _)| **k == kind).map(|(_, n)| *n).max().unwrap_or(1);
+    let labels = multiscale.as_ref().map_or(&[][..], |m| &m.labels);
+    let (pairs, names) = components(input, count(Lead::Time) as usize, count(Lead::Channel) as usize, labels)?;
+    let index = |(t, c): &(usize, usize)| {
+        kinds
+            .iter()
+            .zip(&meta.shape)
+            .map(|(kind, n)| match kind {
+                Lead::Time if *n > 1 => *t as u64,
+                Lead::Channel if *n > 1 => *c as u64,
+                _ => 0,
+            })
+            .collect()
+    };
+    let components: Vec<Vec<u64>> = pairs.iter().map(index).collect();
+
+    let codec_text = meta
+        .byte_codecs
+        .iter()
+        .filter(|c| !matches!(c.as_str(), "bytes" | "transpose"))
+        .cloned()
+        .collect::<Vec<_>>()
+        .join(" ");
+    let sharded = if meta.shard.is_some() { "sharded, " } else { "" };
+    let ome = multiscale.as_ref().map_or(String::new(), |m| format!("OME-Zarr {} on ", m.version));
+    let codec_text = if codec_text.is_empty() { "uncompressed".to_string() } else { codec_text };
+    let mut info = VolumeInfo::plain(shape, meta.dtype, format!("{ome}Zarr v{}, {sharded}{codec_text}", meta.version));
+    info.chunk = Some(chunk);
+    (info.components, info.component_names) = (components.len(), names);
+    if let Some(m) = &multiscale {
+        geometry(&folder, m, lead, n, &mut info)?;
+    }
+
+    let failed = |e: String| Error::file(&folder, format!("the Zarr array cannot be read: {e}"));
+    let store = FilesystemStore::new(&folder).map_err(|e| failed(e.to_string()))?;
+    let array = guarded(|| Array::open(Arc::new(store), "/").map_err(|e| e.to_string())).map_err(failed)?;
+    let codecs = match &meta.shard {
+        None => array.codecs(),
+        Some(shard) => {
+            let list = serde_json::from_value::<Vec<_>>(shard.codecs.clone()).map_err(|e| failed(e.to_string()))?;
+            Arc::new(guarded(|| CodecChain::from_metadata(&list).map_err(|e| e.to_string())).map_err(failed)?)
+        }
+    };
+    let fill = with_dtype!(meta.dtype, T => {
+        let bytes = array.fill_value().as_ne_bytes();
+        if bytes.len() != size_of::<T>() {
+            return Err(failed(format!("the fill value has {} bytes", bytes.len())));
+        }
+        let little = cfg!(target_endian = "little");
+        if little { T::from_le_slice(bytes) } else { T::from_be_slice(bytes) }.to_f64()
+    });
+    let inner = meta.inner.iter().filter_map(|n| NonZeroU64::new(*n)).collect();
+    let grid = std::array::from_fn(|a| shape[a].div_ceil(chunk[a]) as i64);
+    let options = CodecOptions::default().with_concurrent_target(1);
+    let shards = Shards::default();
+    Ok((info, ZarrArray { folder, meta, array, codecs, inner, fill, shards, lead, components, grid, options }))
+}
+
+/// Runs a call into the Zarr library; a panic there (broken metadata or data) becomes an error.
+fn guarded<R>(f: impl FnOnce() -> Result<R, String>) -> Result<R, String> {
+    std::panic::catch_unwind(std::panic::AssertUnwindSafe(f))
+        .unwrap_or_else(|_| Err("the data are corrupt".to_string()))
+}
+
+impl ZarrArray {
+    /// Folder of the array.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// File of an outer chunk or shard.
+    pub fn file_of(&self, outer: &[u64]) -> PathBuf {
+        self.folder.join(self.array.chunk_key(outer).as_str())
+    }
+
+    /// Outer chunks (files) per axis.
+    pub fn outer_grid(&self) -> Vec<u64> {
+        self.meta.shape.iter().zip(&self.meta.outer).map(|(n, c)| n.div_ceil(*c)).collect()
+    }
+
+    /// Index of the inner chunk in the whole array.
+    fn index(&self, component: usize, chunk: [i64; 3]) -> Result<Vec<u64>> {
+        let fits = (0..3).all(|a| (0..self.grid[a]).contains(&chunk[a]));
+        let lead = self.components.get(component).filter(|_| fits).ok_or_else(|| {
+            Error::Failed(format!("chunk {chunk:?} of component {component} is outside the grid {:?}", self.grid))
+        })?;
+        let n = self.meta.shape.len();
+        let mut index: Vec<u64> = lead.iter().zip(&self.meta.inner).map(|(i, c)| i / c).collect();
+        index.extend(chunk[3 - (n - self.lead)..].iter().map(|i| *i as u64));
+        Ok(index)
+    }
+
+    /// Decodes one inner chunk into `dst`; see [`super::Source::read_chunk`].
+    pub fn read_chunk(&self, component: usize, chunk: [i64; 3], dst: &mut Voxels) -> Result<ChunkRead> {
+        let index = self.index(component, chunk)?;
+        let Some((path, bytes)) = self.encoded(&index)? else {
+            return Ok(ChunkRead::Missing(self.fill));
+        };
+        let stored_bytes = bytes.len() as u64;
+        let corrupt = |e: String| Error::file(&path, format!("chunk {index:?} cannot be decoded: {e}"));
+        let size = self.meta.dtype.size() as u64;
+        let want = self.meta.inner.iter().product::<u64>() * size;
+        super::shards::check_declared(&bytes, want, &self.meta.byte_codecs).map_err(corrupt)?;
+        let decoded = guarded(|| {
+            let (kind, fill) = (self.array.data_type(), self.array.fill_value());
+            self.codecs.decode(Cow::Owned(bytes), &self.inner, kind, fill, &self.options).map_err(|e| e.to_string())
+        })
+        .map_err(corrupt)?;
+        let ArrayBytes::Fixed(decoded) = decoded else { return Err(corrupt("not of one size per voxel".into())) };
+        if decoded.len() as u64 != want {
+            return Err(corrupt(format!("it expands to {} bytes, the metadata say {want}", decoded.len())));
+        }
+        // The selected time and channel inside the chunk.
+        let lead = &self.meta.inner[..self.lead];
+        let part = self.components[component].iter().zip(lead).fold(0, |at, (i, c)| at * c + i % c);
+        let into = dst.as_bytes_mut();
+        let one = want / lead.iter().product::<u64>();
+        if into.len() as u64 != one || dst.dtype() != self.meta.dtype {
+            return Err(Error::Failed(format!(
+                "a buffer of {} voxels cannot hold a chunk of {}",
+                dst.len(),
+                one / size
+            )));
+        }
+        dst.as_bytes_mut().copy_from_slice(&decoded[(part * one) as usize..][..one as usize]);
+        Ok(ChunkRead::Data { stored_bytes })
+    }
+
+    /// The stored bytes of an inner chunk and the file they are in; `None` where it is not stored.
+    fn encoded(&self, index: &[u64]) -> Result<Option<(PathBuf, Vec<u8>)>> {
+        let Some(shard_meta) = &self.meta.shard else {
+            let path = self.file_of(index);
+            let most = self.most_encoded();
+            let Some((file, len)) = open_if_there(&path)? else { return Ok(None) };
+            if len > most {
+                return Err(Error::file(&path, format!("a chunk of {len} bytes; decoded it has only {}", most / 2)));
+            }
+            let mut bytes = vec![0; len as usize];
+            file.read_exact_at(&mut bytes, 0).map_err(|e| Error::file(&path, e))?;
+            return Ok(Some((path, bytes)));
+        };
+        let outer: Vec<u64> = index.iter().zip(&shard_meta.grid).map(|(i, g)| i / g).collect();
+        let shard = self.shards.get(&outer, || {
+            let path = self.file_of(&outer);
+            match open_if_there(&path)? {
+                None => Ok(None),
+                Some((file, len)) => Shard::open(path, file, len, shard_meta).map(Some),
+            }
+        })?;
+        let Some(shard) = shard else { return Ok(None) };
+        let entry = index.iter().zip(&shard_meta.grid).fold(0, |at, (i, g)| at * g + i % g);
+        let bytes = shard.read(entry as usize, index, self.most_encoded())?;
+        Ok(bytes.map(|b| (shard.path().to_path_buf(), b)))
+    }
+
+    /// Longest stored form of an inner chunk that is believed.
+    fn most_encoded(&self) -> u64 {
+        2 * (self.meta.inner.iter().product::<u64>() * self.meta.dtype.size() as u64 + (1 << 16))
+    }
+
+    /// Fills a box by decoding the chunks that it touches, one after the other.
+    pub fn read(
+        &self,
+        component: usize,
+        region: Region,
+        info: &VolumeInfo,
+        mut dst: crate::grid::AnyViewMut,
+    ) -> Result<u64> {
+        let chunk_shape = info.chunk.unwrap_or([1; 3]);
+        let mut chunk = Voxels::zeroed(info.dtype, chunk_shape.iter().product());
+        let mut read = 0;
+        for index in region.cells([0; 3], chunk_shape).iter() {
+            match self.read_chunk(component, index, &mut chunk)? {
+                ChunkRead::Missing(fill) => chunk.fill(fill),
+                ChunkRead::Data { stored_bytes } => read += stored_bytes,
+            }
+            let cell = Region::of_cell(index, [0; 3], chunk_shape);
+            crate::brick::gather::copy_common(chunk.view(chunk_shape), cell, super::reborrow(&mut dst), region);
+        }
+        Ok(read)
+    }
+}
+
+/// Opens a chunk's file; `None` where there is none.
+fn open_if_there(path: &Path) -> Result<Option<(File, u64)>> {
+    match File::open(path) {
+        Ok(file) => {
+            let meta = file.metadata().map_err(|e| Error::file(path, e))?;
+            if meta.is_dir() {
+                return Err(Error::file(path, "is a folder, where a chunk is expected"));
+            }
+            Ok(Some((file, meta.len())))
+        }
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(Error::file(path, e)),
+    }
+}

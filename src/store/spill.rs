@@ -1,0 +1,118 @@
+//! Scratch arrays on disk: what tasks leave for the second phase. Mapped, so that small boxes cost no system call; the
+//! room is reserved first, so that a full disk is an error at the start and not a fault in the middle.
+
+use std::fs::{File, OpenOptions};
+use std::path::{Path, PathBuf};
+
+use memmap2::MmapRaw;
+
+use crate::grid::{Region, Shape};
+use crate::{Error, Result};
+
+/// `planes` dense arrays of one shape and item size, one after the other, in a file.
+#[derive(Debug)]
+pub struct Spill {
+    path: PathBuf,
+    file: File,
+    map: MmapRaw,
+    pub shape: Shape,
+    planes: usize,
+    item: usize,
+}
+
+impl Spill {
+    /// Opens or creates the array. An existing file of the right size keeps its contents.
+    pub fn open(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<Spill> {
+        let fail = |what: &str, e: std::io::Error| Error::file(path, format!("cannot {what} scratch: {e}"));
+        let bytes = shape.iter().try_fold(planes * item, |n, &s| n.checked_mul(s));
+        let bytes = bytes.ok_or_else(|| Error::file(path, "the scratch array is too large"))?;
+        if let Some(dir) = path.parent() {
+            std::fs::create_dir_all(dir).map_err(|e| fail("create the folder of", e))?;
+        }
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(path)
+            .map_err(|e| fail("open", e))?;
+        reserve(&file, bytes.max(1) as u64).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
+        let map = MmapRaw::map_raw(&file).map_err(|e| fail("map", e))?;
+        Ok(Spill { path: path.to_path_buf(), file, map, shape, planes, item })
+    }
+
+    /// Writes the voxels of `region` of one plane; `bytes` are dense. Boxes written at the same time must be disjoint.
+    /// Panics if extents disagree.
+    pub fn write(&self, plane: usize, region: Region, bytes: &[u8]) {
+        assert_eq!(bytes.len(), region.voxels() * self.item);
+        let row = region.shape()[2] * self.item;
+        for (i, offset) in self.rows(plane, region).enumerate() {
+            // SAFETY: the row lies inside the mapping (checked in `rows`), the mapping lives as long as `self`, and callers
+            // write disjoint boxes, so no other thread touches these bytes.
+            unsafe {
+                std::ptr::copy_nonoverlapping(bytes[i * row..].as_ptr(), self.map.as_mut_ptr().add(offset), row);
+            }
+        }
+    }
+
+    /// Reads the voxels of `region` of one plane into `out`, dense. Nobody may write that box meanwhile.
+    pub fn read(&self, plane: usize, region: Region, out: &mut [u8]) {
+        assert_eq!(out.len(), region.voxels() * self.item);
+        let row = region.shape()[2] * self.item;
+        for (i, offset) in self.rows(plane, region).enumerate() {
+            // SAFETY: as in `write`; reading happens after the writers are done.
+            unsafe { std::ptr::copy_nonoverlapping(self.map.as_ptr().add(offset), out[i * row..].as_mut_ptr(), row) };
+        }
+    }
+
+    /// Makes what was written durable.
+    pub fn flush(&self) -> Result<()> {
+        self.map.flush().map_err(|e| Error::file(&self.path, format!("cannot write scratch: {e}")))?;
+        self.file.sync_data().map_err(|e| Error::file(&self.path, format!("cannot write scratch: {e}")))
+    }
+
+    fn rows(&self, plane: usize, region: Region) -> impl Iterator<Item = usize> + use<> {
+        assert!(plane < self.planes && Region::whole(self.shape).contains(&region), "{region:?} outside {:?}", self.shape);
+        let ([nz, ny, nx], item) = (self.shape, self.item);
+        let lines = Region::new(region.lo, [region.hi[0], region.hi[1], region.lo[2] + 1]);
+        lines.iter().map(move |[z, y, x]| (((plane * nz + z as usize) * ny + y as usize) * nx + x as usize) * item)
+    }
+}
+
+/// Reserves room on disk, so that later writes into the mapping cannot fail for want of it.
+fn reserve(file: &File, bytes: u64) -> std::io::Result<()> {
+    if file.metadata()?.len() != bytes {
+        file.set_len(bytes)?;
+    }
+    use std::os::fd::AsRawFd;
+    // SAFETY: a valid descriptor and plain numbers.
+    match unsafe { libc::posix_fallocate(file.as_raw_fd(), 0, bytes as libc::off_t) } {
+        0 => Ok(()),
+        // File systems without the call extend sparse; the size is set already.
+        libc::EOPNOTSUPP | libc::EINVAL => Ok(()),
+        code => Err(std::io::Error::from_raw_os_error(code)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn boxes_come_back_after_reopening() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cells");
+        let region = Region::new([1, 0, 2], [3, 2, 4]);
+        let bytes: Vec<u8> = (0..16).collect();
+        let spill = Spill::open(&path, [3, 2, 5], 2, 2).unwrap();
+        spill.write(1, region, &bytes);
+        spill.flush().unwrap();
+        drop(spill);
+        let again = Spill::open(&path, [3, 2, 5], 2, 2).unwrap();
+        let mut out = vec![9; 16];
+        again.read(1, region, &mut out);
+        assert_eq!(out, bytes);
+        again.read(0, region, &mut out);
+        assert_eq!(out, [0; 16]);
+    }
+}

@@ -1,0 +1,117 @@
+//! What the tests of sources share.
+#![allow(dead_code)] // each test file uses a part of it
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use occlude::brick::Voxels;
+use occlude::config::{Input, InputKind, Place, RawFormat, Select};
+use occlude::grid::Region;
+use occlude::store::Source;
+
+pub fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+pub fn fixture(name: &str) -> Input {
+    file_input(&data(name))
+}
+
+pub fn file_input(path: &Path) -> Input {
+    Input {
+        name: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        place: Place::default(),
+        kind: InputKind::Path { path: path.to_path_buf(), raw: None },
+        level: 0,
+        array: None,
+        channel: Select::Index(0),
+        time: Select::Index(0),
+        spacing: None,
+        unit: None,
+        origin: None,
+        slope: None,
+        intercept: None,
+        nodata: None,
+    }
+}
+
+pub fn raw_input(path: &Path, raw: RawFormat) -> Input {
+    Input { kind: InputKind::Path { path: path.to_path_buf(), raw: Some(raw) }, ..file_input(path) }
+}
+
+/// Opens, prepares and reads one component whole.
+pub fn whole(input: &Input, component: usize) -> occlude::Result<(Source, Voxels)> {
+    let mut source = Source::open(input)?;
+    let scratch = tempfile::tempdir().unwrap();
+    source.prepare(scratch.path(), &|_| true)?;
+    let shape = source.info().shape;
+    assert!(shape.iter().product::<usize>() < 1 << 28, "{shape:?} was believed");
+    let mut voxels = Voxels::zeroed(source.info().dtype, shape.iter().product());
+    source.read(component, Region::whole(shape), voxels.view_mut(shape))?;
+    Ok((source, voxels))
+}
+
+pub fn near(a: [f64; 3], b: [f64; 3]) {
+    assert!((0..3).all(|i| (a[i] - b[i]).abs() < 1e-6), "{a:?}, {b:?} expected");
+}
+
+pub fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut writer = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    writer.write_all(bytes).unwrap();
+    writer.finish().unwrap()
+}
+
+pub fn copy_tree(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy_tree(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).unwrap();
+        }
+    }
+}
+
+/// SHA-256, as the published checksums are (FIPS 180-4).
+pub fn sha256(data: &[u8]) -> String {
+    // The constants are the fractional parts of roots of the first primes.
+    let primes: Vec<u64> = (2u64..).filter(|n| (2..*n).all(|d| n % d != 0)).take(64).collect();
+    let root = |p: u64, cube: bool| -> u32 {
+        // floor(root(p) * 2^32) by bisection in integers, without its whole part.
+        let (mut lo, mut hi) = (0u128, 1u128 << 37);
+        while hi - lo > 1 {
+            let mid = (lo + hi) / 2;
+            let (value, scale) = if cube { (mid * mid * mid, 96) } else { (mid * mid, 64) };
+            if value <= (p as u128) << scale { lo = mid } else { hi = mid }
+        }
+        lo as u32
+    };
+    let k: Vec<u32> = primes.iter().map(|p| root(*p, true)).collect();
+    let mut h: Vec<u32> = primes[..8].iter().map(|p| root(*p, false)).collect();
+    let mut tail = data[data.len() / 64 * 64..].to_vec();
+    tail.push(0x80);
+    tail.resize((tail.len() + 8).div_ceil(64) * 64 - 8, 0);
+    tail.extend((data.len() as u64 * 8).to_be_bytes());
+    for block in data.chunks_exact(64).chain(tail.chunks_exact(64)) {
+        let mut w: Vec<u32> = block.chunks_exact(4).map(|b| u32::from_be_bytes(b.try_into().unwrap())).collect();
+        w.resize(64, 0);
+        for i in 16..64 {
+            let s0 = w[i - 15].rotate_right(7) ^ w[i - 15].rotate_right(18) ^ w[i - 15] >> 3;
+            let s1 = w[i - 2].rotate_right(17) ^ w[i - 2].rotate_right(19) ^ w[i - 2] >> 10;
+            w[i] = w[i - 16].wrapping_add(s0).wrapping_add(w[i - 7]).wrapping_add(s1);
+        }
+        let mut v: [u32; 8] = h[..8].try_into().unwrap();
+        for i in 0..64 {
+            let [a, b, c, d, e, f, g, last] = v;
+            let s1 = e.rotate_right(6) ^ e.rotate_right(11) ^ e.rotate_right(25);
+            let t1 = last.wrapping_add(s1).wrapping_add((e & f) ^ (!e & g)).wrapping_add(k[i]).wrapping_add(w[i]);
+            let s0 = a.rotate_right(2) ^ a.rotate_right(13) ^ a.rotate_right(22);
+            let t2 = s0.wrapping_add((a & b) ^ (a & c) ^ (b & c));
+            v = [t1.wrapping_add(t2), a, b, c, d.wrapping_add(t1), e, f, g];
+        }
+        h.iter_mut().zip(v).for_each(|(h, v)| *h = h.wrapping_add(v));
+    }
+    h.iter().map(|v| format!("{v:08x}")).collect()
+}

@@ -1,0 +1,475 @@
+//! Volumes written by other programs (nibabel, pynrrd, SimpleITK, tifffile, zarr-python, NumPy) and by hand read back
+//! voxel for voxel, and what files that lie are answered with.
+
+mod common_sources;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use common_sources::*;
+use occlude::brick::Voxels;
+use occlude::config::{Input, InputKind, RawFormat, Select};
+use occlude::grid::{DType, Region};
+use occlude::store::Source;
+use occlude::store::source::ChunkRead;
+
+/// The fixtures hold `z * 40 + y * 7 + x + 100 * component`.
+fn expected(shape: [usize; 3], component: usize) -> impl Fn(usize) -> f64 {
+    move |i| {
+        let (z, y, x) = (i / (shape[1] * shape[2]), i / shape[2] % shape[1], i % shape[2]);
+        (z * 40 + y * 7 + x + 100 * component) as f64
+    }
+}
+
+/// Opens, prepares and checks a fixture of 4 x 5 x 6 voxels, in whole and in a box.
+fn check(input: &Input, component: usize, value: usize) -> Source {
+    let (source, voxels) = whole(input, component).unwrap_or_else(|e| panic!("{}: {e}", input.name));
+    assert_eq!(source.info().shape, [4, 5, 6], "{}", input.name);
+    let wrap = |v: f64| if voxels.dtype() == DType::U8 { v % 256.0 } else { v };
+    for i in 0..voxels.len() {
+        assert_eq!(voxels.at(i), wrap(expected([4, 5, 6], value)(i)), "{} voxel {i}", input.name);
+    }
+    let region = Region::new([1, 2, 1], [4, 4, 6]);
+    let mut part = Voxels::zeroed(source.info().dtype, region.voxels());
+    source.read(component, region, part.view_mut(region.shape())).unwrap();
+    for (i, [z, y, x]) in region.iter().enumerate() {
+        assert_eq!(part.at(i), wrap((z * 40 + y * 7 + x) as f64 + 100.0 * value as f64), "{} box", input.name);
+    }
+    source.release(Region::whole([4, 5, 6]));
+    assert_eq!(source.identity().unwrap(), Source::open(input).unwrap().identity().unwrap());
+    source
+}
+
+#[test]
+fn nifti_of_each_type_and_byte_order() {
+    for (name, dtype) in [("u8", DType::U8), ("i16", DType::I16), ("f64", DType::F64)] {
+        let source = check(&fixture(&format!("nifti/{name}.nii")), 0, 0);
+        let info = source.info();
+        assert_eq!((info.dtype, info.unit.as_deref()), (dtype, Some("millimeter")));
+        near(info.spacing, [2.0, 0.6, 0.5]);
+        near(info.origin, [30.0, -20.0, 10.0]);
+        assert_eq!(info.orientation.as_ref().unwrap().space, "RAS");
+        assert!(info.affine.is_identity());
+    }
+    let source = check(&fixture("nifti/be2.nii"), 0, 0);
+    let info = source.info();
+    assert_eq!((info.dtype, info.unit.as_deref(), info.format.as_str()), (DType::I16, Some("micrometer"), "NIfTI-2"));
+    assert_eq!((info.affine.slope, info.affine.intercept), (2.0, -1.0));
+    // Rotated: the origin is 0 and the matrix kept.
+    assert_eq!(info.origin, [0.0; 3]);
+    let m = info.orientation.as_ref().unwrap().matrix;
+    near([m[0][1], m[1][0], m[2][3]], [-0.6, 0.5, 30.0]);
+}
+
+#[test]
+fn nifti_time_points_are_selected_and_the_qform_gives_the_matrix() {
+    let mut input = fixture("nifti/time.nii.gz");
+    input.time = Select::Index(1);
+    let source = check(&input, 0, 1);
+    let m = source.info().orientation.as_ref().unwrap().matrix;
+    near([m[0][1], m[1][0], m[2][2]], [-0.6, 0.5, 2.0]);
+    input.time = Select::All;
+    let source = check(&input, 1, 1);
+    assert_eq!(source.info().component_names, ["time 0", "time 1"]);
+    input.time = Select::Index(2);
+    let e = Source::open(&input).unwrap_err();
+    assert_eq!(e.exit_code(), 2);
+    assert!(e.to_string().contains("input.time.nii.gz.time: 2 does not exist; the input has 2"), "{e}");
+}
+
+#[test]
+fn nrrd_raw_gzip_attached_detached_and_interleaved() {
+    for (name, dtype) in [("raw", DType::I16), ("gz", DType::F32)] {
+        let source = check(&fixture(&format!("nrrd/{name}.nrrd")), 0, 0);
+        let info = source.info();
+        assert_eq!(
+            (info.dtype, info.unit.as_deref()),
+            (dtype, Some("millimeter")),
+            "a medical space means millimetres"
+        );
+        near(info.spacing, [2.0, 0.6, 0.5]);
+        near(info.origin, [3.0, 2.0, 1.0]);
+        assert_eq!(info.orientation.as_ref().unwrap().space, "LPS");
+    }
+    let source = check(&fixture("nrrd/det.nhdr"), 0, 0);
+    assert_eq!((source.info().dtype, source.info().unit.as_deref()), (DType::U16, Some("micrometer")));
+    near(source.info().spacing, [2.0, 0.6, 0.5]);
+    let mut input = fixture("nrrd/vec.nrrd");
+    input.channel = Select::Index(1);
+    check(&input, 0, 1);
+    input.channel = Select::All;
+    check(&input, 1, 1);
+}
+
+#[test]
+fn metaimage_plain_packed_detached_and_interleaved() {
+    for name in ["plain.mha", "det.mhd"] {
+        let source = check(&fixture(&format!("meta/{name}")), 0, 0);
+        near(source.info().spacing, [2.0, 0.6, 0.5]);
+        near(source.info().origin, [3.0, 2.0, 1.0]);
+        assert_eq!(source.info().unit.as_deref(), Some("millimeter"));
+    }
+    let source = check(&fixture("meta/rot.mha"), 0, 0);
+    let m = source.info().orientation.as_ref().unwrap().matrix;
+    near([m[0][1], m[1][0], m[2][2]], [-0.6, 0.5, 2.0]); // as SimpleITK maps indices to points
+    assert_eq!(source.info().origin, [0.0; 3]);
+    let mut input = fixture("meta/vec.mha");
+    input.channel = Select::Index(1);
+    check(&input, 0, 1);
+}
+
+#[test]
+fn tiff_strips_tiles_folders_imagej_and_ome() {
+    let source = check(&fixture("tiff/strips.tif"), 0, 0);
+    assert_eq!(source.spool_bytes(), 0, "plain strips are read in place");
+    for (name, dtype) in [("be_lzwish", DType::I32), ("lzw", DType::I8), ("white", DType::U8), ("slices", DType::F32)] {
+        let path = if name == "slices" { "tiff/slices".to_string() } else { format!("tiff/{name}.tif") };
+        assert_eq!(check_wrapped(&fixture(&path)).info().dtype, dtype);
+    }
+    let (source, voxels) = whole(&fixture("tiff/tiled.tif"), 0).unwrap();
+    assert_eq!((source.info().shape, voxels.len()), ([2, 40, 50], 4000));
+    assert!((0..4000).all(|i| voxels.at(i) == i as f64));
+
+    let mut input = fixture("tiff/imagej.tif");
+    input.channel = Select::Index(1);
+    let source = check(&input, 0, 1);
+    near(source.info().spacing, [2.0, 0.5, 0.25]);
+    assert_eq!(source.info().unit.as_deref(), Some("micrometer"));
+
+    let mut input = fixture("tiff/ome.ome.tif");
+    input.channel = Select::All;
+    let source = check(&input, 1, 1);
+    near(source.info().spacing, [0.3, 0.2, 0.1]);
+    assert_eq!(source.info().unit.as_deref(), Some("micrometer"));
+    assert_eq!(source.info().component_names, ["DAPI", "GFP"]);
+}
+
+#[test]
+fn npy_in_both_orders() {
+    assert_eq!(check(&fixture("npy/c.npy"), 0, 0).info().dtype, DType::U16);
+    assert_eq!(check(&fixture("npy/f.npy"), 0, 0).info().dtype, DType::F32);
+    let (source, voxels) = whole(&fixture("npy/2d.npy"), 0).unwrap();
+    assert_eq!(source.info().shape, [1, 5, 6]);
+    assert_eq!(voxels.at(7), 40.0 + 7.0 + 1.0);
+}
+
+#[test]
+fn zarr_v3_shards_missing_chunks_and_v2_orders() {
+    let source = Source::open(&fixture("zarr/v3sharded")).unwrap();
+    assert_eq!((source.info().chunk, source.info().dtype), (Some([2, 2, 3]), DType::U16));
+    let mut chunk = Voxels::zeroed(DType::U16, 12);
+    assert_eq!(source.read_chunk(0, [1, 1, 1], &mut chunk).unwrap(), ChunkRead::Missing(7.0));
+    assert!(matches!(source.read_chunk(0, [1, 2, 1], &mut chunk).unwrap(), ChunkRead::Data { stored_bytes: 1.. }));
+    assert_eq!(chunk.at(0), (2 * 40 + 4 * 7 + 3) as f64);
+    assert!(source.read_chunk(0, [2, 0, 0], &mut chunk).is_err());
+    assert!(source.read_chunk(1, [0, 0, 0], &mut chunk).is_err());
+    let (_, voxels) = whole(&fixture("zarr/v3sharded"), 0).unwrap();
+    for (i, [z, y, x]) in Region::whole([4, 5, 6]).iter().enumerate() {
+        let hole = z >= 2 && (2..4).contains(&y) && x >= 3;
+        assert_eq!(voxels.at(i), if hole { 7.0 } else { expected([4, 5, 6], 0)(i) });
+    }
+
+    let (source, voxels) = whole(&fixture("zarr/v3plain"), 0).unwrap();
+    assert_eq!(source.info().chunk, Some([2, 3, 4]));
+    for (i, [z, y, x]) in Region::whole([4, 5, 6]).iter().enumerate() {
+        let hole = z < 2 && y < 3 && x >= 4;
+        assert!(if hole { voxels.at(i).is_nan() } else { voxels.at(i) == expected([4, 5, 6], 0)(i) });
+    }
+    let mut chunk = Voxels::zeroed(DType::F32, 24);
+    assert!(matches!(source.read_chunk(0, [0, 0, 1], &mut chunk).unwrap(), ChunkRead::Missing(v) if v.is_nan()));
+    assert_eq!(check(&fixture("zarr/v2be"), 0, 0).info().dtype, DType::I16);
+    assert_eq!(check(&fixture("zarr/v2f"), 0, 0).info().dtype, DType::F64);
+}
+
+#[test]
+fn ome_zarr_levels_channels_times_and_placement() {
+    let mut input = fixture("zarr/ome05");
+    (input.time, input.channel) = (Select::Index(1), Select::Index(1));
+    let source = check(&input, 0, 4);
+    near(source.info().spacing, [4.0, 1.0, 0.5]); // the group's scale of 2 is applied after the dataset's
+    near(source.info().origin, [20.0, 40.0, 60.0]);
+    assert_eq!(source.info().unit.as_deref(), Some("micrometer"));
+    (input.time, input.channel) = (Select::Index(0), Select::All);
+    let source = check(&input, 2, 2);
+    assert_eq!(source.info().component_names, ["DAPI", "GFP", "RFP"]);
+    (input.time, input.level) = (Select::Index(1), 1);
+    let (source, voxels) = whole(&input, 2).unwrap();
+    assert_eq!((source.info().shape, source.info().chunk), ([4, 3, 3], Some([2, 2, 3])));
+    near(source.info().spacing, [4.0, 2.0, 1.0]);
+    assert_eq!(voxels.at(4), (2 * 7 + 2 + 500) as f64); // z 0, y 1, x 1 of the coarse level
+    input.level = 2;
+    let e = Source::open(&input).unwrap_err().to_string();
+    assert!(e.contains("input.ome05.level: 2: the image has 2 levels, 0 to 1"), "{e}");
+
+    let source = check(&fixture("zarr/ome04"), 0, 0);
+    near(source.info().spacing, [2.0, 0.5, 0.25]);
+    let mut input = fixture("zarr/ome04");
+    input.array = Some("0".into());
+    near(check(&input, 0, 0).info().spacing, [2.0, 0.5, 0.25]);
+    near(check(&fixture("zarr/ome04/0"), 0, 0).info().spacing, [2.0, 0.5, 0.25]);
+    input.array = Some("../../nifti".into());
+    assert_eq!(Source::open(&input).unwrap_err().exit_code(), 2);
+    input.array = Some("7".into());
+    let e = Source::open(&input).unwrap_err().to_string();
+    assert!(e.contains("it has: 0"), "{e}");
+}
+
+#[test]
+fn types_that_are_not_read_are_refused_by_name() {
+    for (path, name) in [
+        ("nifti/complex.nii", "complex64"),
+        ("nifti/rgb.nii", "RGB"),
+        ("nifti/i64.nii", "i64"),
+        ("tiff/rgb.tif", "RGB"),
+        ("npy/bool.npy", "bool"),
+    ] {
+        let e = Source::open(&fixture(path)).unwrap_err();
+        assert_eq!(e.exit_code(), 1);
+        let text = e.to_string();
+        assert!(text.contains(name) && text.contains("accepted are u8, i8"), "{path}: {text}");
+    }
+}
+
+#[test]
+fn the_config_overrides_the_header() {
+    let mut input = fixture("nifti/be2.nii");
+    input.spacing = Some([3.0, 2.0, 1.0]);
+    input.unit = Some("um".into());
+    input.origin = Some([1.0, 2.0, 3.0]);
+    input.slope = Some(0.5);
+    input.nodata = Some(7.0);
+    let info = Source::open(&input).unwrap().info().clone();
+    assert_eq!((info.spacing, info.origin), ([3.0, 2.0, 1.0], [1.0, 2.0, 3.0]));
+    assert_eq!((info.affine.slope, info.affine.intercept), (0.5, -1.0), "the intercept of the file stays");
+    assert_eq!((info.unit.as_deref(), info.nodata), (Some("micrometer"), Some(7.0)));
+    input.spacing = Some([0.0, 1.0, 1.0]);
+    assert!(Source::open(&input).unwrap_err().to_string().starts_with("input.be2.nii.spacing"));
+}
+
+#[test]
+fn float_nodata_becomes_nan_and_integer_nodata_stays() {
+    for (path, is_nan) in [("tiff/slices", true), ("zarr/v3plain", true), ("nrrd/raw.nrrd", false)] {
+        let mut input = fixture(path);
+        input.nodata = Some(41.0);
+        let (_, voxels) = whole(&input, 0).unwrap();
+        let at = 5 * 6 + 1; // z 1, y 0, x 1
+        assert_eq!(voxels.at(at).is_nan(), is_nan, "{path}");
+        assert!(is_nan || voxels.at(at) == 41.0);
+        assert_eq!(voxels.at(at - 1), 40.0);
+    }
+}
+
+#[test]
+fn raw_files_of_any_order_offset_and_packing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("v.raw");
+    let shape = [4, 5, 6];
+    let body: Vec<u8> = (0..120).flat_map(|i| (expected(shape, 0)(i) as i32).to_be_bytes()).collect();
+    let bytes = [b"seven..".to_vec(), body.clone()].concat();
+    fs::write(&path, &bytes).unwrap();
+    let raw = RawFormat { shape, dtype: DType::I32, big_endian: true, offset: 7, trailing_ignore: false };
+    check(&raw_input(&path, raw.clone()), 0, 0);
+    // Bytes after the voxels.
+    fs::write(&path, [&bytes[..], b"tail"].concat()).unwrap();
+    let e = Source::open(&raw_input(&path, raw.clone())).unwrap_err().to_string();
+    assert!(e.contains("4 more follow") && e.contains("trailing = \"ignore\""), "{e}");
+    check(&raw_input(&path, RawFormat { trailing_ignore: true, ..raw.clone() }), 0, 0);
+    // Too short.
+    fs::write(&path, &bytes[..480]).unwrap();
+    let e = Source::open(&raw_input(&path, raw.clone())).unwrap_err().to_string();
+    assert!(e.contains("has 480 bytes") && e.contains("487"), "{e}");
+    // Gzip: right, too long, too short, cut off.
+    let path = folder.path().join("v.raw.gz");
+    fs::write(&path, gzip(&bytes)).unwrap();
+    let input = raw_input(&path, raw.clone());
+    assert_eq!(Source::open(&input).unwrap().spool_bytes(), 480);
+    check(&input, 0, 0);
+    for (content, number) in [([&bytes[..], b"tail"].concat(), "491"), (bytes[..400].to_vec(), "400")] {
+        fs::write(&path, gzip(&content)).unwrap();
+        let e = whole(&input, 0).unwrap_err().to_string();
+        assert!(e.contains(&format!("expand to {number} bytes, but the header says 487")), "{e}");
+    }
+    let packed = gzip(&bytes);
+    fs::write(&path, &packed[..packed.len() / 2]).unwrap();
+    assert!(whole(&input, 0).unwrap_err().to_string().contains("cut off"), "a cut gzip stream");
+}
+
+#[test]
+fn a_spool_leaves_nothing_behind_and_stops_on_request() {
+    let scratch = tempfile::tempdir().unwrap();
+    let mut source = Source::open(&fixture("nifti/time.nii.gz")).unwrap();
+    assert_eq!(source.prepare(scratch.path(), &|_| false).unwrap_err().exit_code(), 130);
+    source.prepare(scratch.path(), &|_| true).unwrap();
+    assert_eq!(fs::read_dir(scratch.path()).unwrap().count(), 0);
+    let mut source = Source::open(&fixture("nifti/time.nii.gz")).unwrap();
+    let mut out = Voxels::zeroed(source.info().dtype, 120);
+    assert!(source.read(0, Region::whole([4, 5, 6]), out.view_mut([4, 5, 6])).is_err(), "not prepared yet");
+    assert!(source.prepare(Path::new("/nonexistent"), &|_| true).is_err());
+}
+
+#[test]
+fn a_file_that_shrinks_is_an_error_not_a_crash() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("v.raw");
+    fs::write(&path, vec![1u8; 1 << 20]).unwrap();
+    let raw =
+        RawFormat { shape: [16, 256, 256], dtype: DType::U8, big_endian: false, offset: 0, trailing_ignore: false };
+    let source = Source::open(&raw_input(&path, raw)).unwrap();
+    fs::write(&path, b"gone").unwrap();
+    let mut out = Voxels::zeroed(DType::U8, 1 << 20);
+    let e = source.read(0, Region::whole([16, 256, 256]), out.view_mut([16, 256, 256])).unwrap_err().to_string();
+    assert!(e.contains("shrank from 1048576 to 4 bytes"), "{e}");
+}
+
+#[test]
+fn nrrd_lists_patterns_and_skips() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let slice = |z: usize| (0..30).map(|i| expected([4, 5, 6], 0)(z * 30 + i) as u8).collect::<Vec<_>>();
+    for z in 0..4 {
+        fs::write(at(&format!("s{:02}.raw", z + 3)), [b"xy".to_vec(), slice(z)].concat()).unwrap();
+    }
+    let head =
+        "NRRD0004\n# comment\ntype: uint8_t\ndimension: 3\nsizes: 6 5 4\nencoding: raw\nkey:=value: with colon\n";
+    let pattern = format!("{head}byte skip: 2\ndata file: s%02d.raw 3 6 1 2\n");
+    let list = format!("{head}byteskip: 2\ndatafile: LIST 2\ns03.raw\ns04.raw\ns05.raw\ns06.raw\n");
+    let all: Vec<u8> = (0..4).flat_map(slice).collect();
+    fs::write(at("all.bin"), [b"line one\nline two\nab".to_vec(), all.clone()].concat()).unwrap();
+    let skips = format!("{head}line skip: 2\nbyte skip: 2\ndata file: all.bin\n");
+    let last = format!("{head}byte skip: -1\ndata file: ./all.bin\n\n");
+    for text in [pattern, list, skips, last] {
+        fs::write(at("v.nhdr"), text).unwrap();
+        check(&file_input(&at("v.nhdr")), 0, 0);
+    }
+    fs::write(at("v.nhdr"), format!("{head}data file: LIST\ns03.raw\ns04.raw\ns05.raw\n")).unwrap();
+    assert!(Source::open(&file_input(&at("v.nhdr"))).is_err(), "three files cannot hold four planes of 6 x 5");
+    let mha = "ObjectType = Image\nNDims = 3\nDimSize = 6 5 4\nElementType = MET_UCHAR\n";
+    fs::write(at("v.mhd"), format!("{mha}HeaderSize = 2\nElementDataFile = s%02d.raw 3 6 1\n")).unwrap();
+    check(&file_input(&at("v.mhd")), 0, 0);
+    fs::write(
+        at("v.mhd"),
+        format!("{mha}HeaderSize = 2\nElementDataFile = LIST\ns03.raw\ns04.raw\ns05.raw\ns06.raw\n"),
+    )
+    .unwrap();
+    check(&file_input(&at("v.mhd")), 0, 0);
+    fs::write(at("v.mhd"), format!("{mha}HeaderSize = -1\nElementDataFile = all.bin\n")).unwrap();
+    check(&file_input(&at("v.mhd")), 0, 0);
+}
+
+#[test]
+fn an_array_in_memory_reads_like_a_file() {
+    let voxels = Voxels::I16((0..120).map(|i| expected([4, 5, 6], 0)(i) as i16).collect());
+    let source = Source::from_array([4, 5, 6], voxels);
+    let mut out = Voxels::zeroed(DType::I16, 6);
+    source.read(0, Region::new([3, 4, 0], [4, 5, 6]), out.view_mut([1, 1, 6])).unwrap();
+    assert_eq!(out, Voxels::I16(vec![148, 149, 150, 151, 152, 153]));
+    assert!(source.read(0, Region::new([3, 4, 0], [5, 5, 6]), out.view_mut([2, 1, 3])).is_err());
+}
+
+#[test]
+fn formats_are_found_by_their_first_bytes_and_unknown_ones_listed() {
+    let folder = tempfile::tempdir().unwrap();
+    for (i, name) in
+        ["npy/c.npy", "nifti/i16.nii", "nrrd/raw.nrrd", "meta/plain.mha", "tiff/strips.tif"].iter().enumerate()
+    {
+        let path = folder.path().join(format!("volume{i}"));
+        fs::copy(data(name), &path).unwrap();
+        check(&file_input(&path), 0, 0);
+    }
+    let path = folder.path().join("odd.raw");
+    fs::write(&path, b"no header here").unwrap();
+    let e = Source::open(&file_input(&path)).unwrap_err().to_string();
+    assert!(e.contains("format = \"raw\"") && e.contains("NRRD"), "{e}");
+    let e = Source::open(&file_input(&folder.path().join("absent.nrrd"))).unwrap_err();
+    assert_eq!((e.exit_code(), e.to_string().contains("no such file")), (1, true));
+    let mut input = fixture("npy/c.npy");
+    input.level = 1;
+    assert_eq!(Source::open(&input).unwrap_err().exit_code(), 2);
+}
+
+#[test]
+fn an_identity_follows_the_content_not_the_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let copy = folder.path().join("copy.nrrd");
+    fs::copy(data("nrrd/raw.nrrd"), &copy).unwrap();
+    let of = |path: &Path| Source::open(&file_input(path)).unwrap().identity().unwrap();
+    assert_eq!(of(&copy), of(&data("nrrd/raw.nrrd")));
+    let before = of(&copy);
+    let mut bytes = fs::read(&copy).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&copy, &bytes).unwrap();
+    assert_ne!(of(&copy), before);
+    let zarr = folder.path().join("z");
+    copy_tree(&data("zarr/v2be"), &zarr);
+    assert_eq!(of(&zarr), of(&data("zarr/v2be")));
+    fs::remove_file(zarr.join("0.0.0")).unwrap();
+    assert_ne!(of(&zarr), of(&data("zarr/v2be")));
+}
+
+/// Checksums of the published volumes' voxels, little-endian (see their README).
+#[test]
+fn published_volumes_have_the_right_voxels() {
+    let Some(folder) = shared_data() else { return };
+    let raw =
+        |shape, dtype, big_endian| Some(RawFormat { shape, dtype, big_endian, offset: 0, trailing_ignore: false });
+    let volumes = [
+        (
+            "cthead_256x256x113_uint16be.raw.gz",
+            raw([113, 256, 256], DType::U16, true),
+            "8a378356d37fc55a977032375b1bd34298c0b137167dd0f05e025d66e0ae5d94",
+        ),
+        (
+            "aneurism_256x256x256_uint8.raw.gz",
+            raw([256; 3], DType::U8, false),
+            "2826a66db406f19bdd9e38cfe42a80b861fbce34a947c24ce511f07f1c160b83",
+        ),
+        (
+            "vismale_128x256x256_uint8.raw.gz",
+            raw([256, 256, 128], DType::U8, false),
+            "3aa9da2a3338259e6952834935b64f81aac567bd7635cdbb85a8e59647a395ed",
+        ),
+        ("colin27_ch2.nii.gz", None, "38e1383cfd10824abc62dd61c9597f83ff899c82e2a84eb37737bdc83bfc9d7d"),
+        ("tooth.nrrd", None, "1ae7d4681ad9b58c3778af0742f3c585354625a6aed232a181c93c669522172e"),
+        ("cells3d_nuclei.tif", None, "3ce5179fcc8bb48110bd2422bdda7ef26c56f1f444be6aca8c1e5ec803d8fc85"),
+    ];
+    let mut seen = 0;
+    for (name, raw, sum) in volumes {
+        let path = folder.join(name);
+        if !path.exists() {
+            eprintln!("skipped: {} is not there", path.display());
+            continue;
+        }
+        let input = Input { kind: InputKind::Path { path, raw }, ..file_input(Path::new(name)) };
+        let (source, voxels) = whole(&input, 0).unwrap();
+        assert_eq!(sha256(voxels.as_bytes()), sum, "{name}");
+        if name.starts_with("colin") {
+            assert_eq!(
+                (source.info().origin, source.info().unit.as_deref()),
+                ([-71.0, -125.0, -90.0], None), // the file names no unit
+            );
+        }
+        seen += 1;
+    }
+    assert!(seen > 0, "the folder of published volumes is there but empty");
+}
+
+/// As `check`, for types in which the values wrap around.
+fn check_wrapped(input: &Input) -> Source {
+    let (source, voxels) = whole(input, 0).unwrap_or_else(|e| panic!("{}: {e}", input.name));
+    for i in 0..voxels.len() {
+        let v = expected([4, 5, 6], 0)(i);
+        let v = if voxels.dtype() == DType::I8 { v as i64 as i8 as f64 } else { v };
+        assert_eq!(voxels.at(i), v, "{} voxel {i}", input.name);
+    }
+    source
+}
+
+fn shared_data() -> Option<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    // Beside the repository, or one folder further up from a worktree.
+    let found = ["../shared/data", "../../shared/data"].into_iter().map(|f| root.join(f)).find(|f| f.is_dir());
+    if found.is_none() {
+        eprintln!("skipped: the published volumes are not at {}", root.join("../shared/data").display());
+    }
+    found
+}
