@@ -1,1 +1,106 @@
-//! Commands.
+//! Commands: words to library calls, results to stdout, everything else to stderr.
+
+pub mod args;
+pub mod attributes;
+pub mod cmd_compare;
+pub mod cmd_info;
+pub mod cmd_pareto;
+pub mod cmd_plan;
+pub mod cmd_preview;
+pub mod cmd_run;
+pub mod draw;
+pub mod human;
+pub mod messages;
+pub mod moments;
+pub mod plot;
+pub mod progress;
+pub mod reader;
+pub mod similarity;
+
+use std::process::ExitCode;
+
+use clap::{CommandFactory, Parser};
+
+use crate::config::{self, Config, Device};
+use crate::{Error, Result};
+use args::{Cli, Command, ConfigArgs, DeviceArg};
+
+/// The program: parses the command line, runs the command, returns the exit code (0 done, 1 failed, 2 wrong usage or
+/// config, 130 interrupted).
+pub fn main() -> ExitCode {
+    messages::restore_sigpipe();
+    messages::hook_panics(std::env::args().any(|a| a == "-v" || a == "--verbose"));
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            let _ = e.print();
+            return ExitCode::from(e.exit_code().clamp(0, 2) as u8);
+        }
+    };
+    messages::start_logs(cli.quiet, cli.verbose);
+    let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| command(&cli)));
+    match outcome {
+        Ok(Ok(code)) => code,
+        Ok(Err(e)) => {
+            messages::error(&e);
+            ExitCode::from(e.exit_code() as u8)
+        }
+        // The hook has said what there is to say.
+        Err(_) => ExitCode::from(1),
+    }
+}
+
+fn command(cli: &Cli) -> Result<ExitCode> {
+    match &cli.command {
+        Command::Run(args) => cmd_run::run(args, cli.quiet)?,
+        Command::Plan(args) => cmd_plan::run(args)?,
+        Command::Info(args) => cmd_info::run(args)?,
+        Command::Compare(args) => return cmd_compare::run(args),
+        Command::Preview(args) => cmd_preview::run(args)?,
+        Command::Pareto(args) => cmd_pareto::run(args, cli.quiet)?,
+        Command::Schema => messages::result_json(&config::schema())?,
+        Command::Completions { shell } => {
+            let mut text = Vec::new();
+            clap_complete::generate(*shell, &mut Cli::command(), "occlude", &mut text);
+            messages::result(&String::from_utf8_lossy(&text))?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The config with `--set` and the flags applied.
+fn load(args: &ConfigArgs, more: &[String]) -> Result<Config> {
+    let sets: Vec<String> = args.sets.iter().chain(more).cloned().collect();
+    let mut config = config::load(&args.config, &sets)?;
+    if let Some(device) = args.device {
+        config.run.device = match device {
+            DeviceArg::Auto => Device::Auto,
+            DeviceArg::Cpu => Device::Cpu,
+            DeviceArg::Gpu => Device::Gpu,
+            DeviceArg::GpuSoftware => Device::GpuSoftware,
+        };
+    }
+    if let Some(threads) = args.threads {
+        config.run.threads = threads.into();
+    }
+    if let Some(memory) = args.memory {
+        config.run.memory = memory;
+    }
+    Ok(config)
+}
+
+/// Wrong usage of a flag (exit code 2).
+fn usage(flag: &str, message: impl std::fmt::Display) -> Error {
+    Error::config(flag, message)
+}
+
+/// Writes a file under a temporary name first, so that no reader sees half of it.
+fn write_whole(path: &std::path::Path, bytes: &[u8]) -> Result<()> {
+    let mut name = path.file_name().ok_or_else(|| Error::file(path, "is not a file name"))?.to_os_string();
+    name.push(format!(".{}.tmp", std::process::id()));
+    let temporary = path.with_file_name(name);
+    std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, path)).map_err(|e| {
+        let _ = std::fs::remove_file(&temporary);
+        Error::file(path, format!("cannot write: {e}"))
+    })
+}

@@ -1,0 +1,214 @@
+//! `occlude compare`.
+
+use std::process::ExitCode;
+
+use serde_json::json;
+
+use super::args::CompareArgs;
+use super::moments::{Magnitudes, Moments};
+use super::reader::Volume;
+use super::similarity::Similarity;
+use super::{human, messages, usage};
+use crate::Result;
+use crate::run::Cancel;
+
+/// How two volumes differ, over the voxels that both have.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Difference {
+    /// Root of the mean squared difference.
+    pub rmse: f64,
+    /// Mean absolute difference.
+    pub mae: f64,
+    /// Mean of A - B.
+    pub bias: f64,
+    pub max_abs: f64,
+    /// 99th percentile of the absolute difference (nearest rank).
+    pub p99: f64,
+    /// Mean structural similarity over whole windows; `None` where no window fits.
+    pub ssim: Option<f64>,
+    /// Pairs that count: neither value is missing.
+    pub n: u64,
+}
+
+/// Compares, prints, and fails beyond the bound.
+pub fn run(args: &CompareArgs) -> Result<ExitCode> {
+    let cancel = messages::interrupts();
+    let a = Volume::open(&args.a, 0, &args.raw, &cancel)?;
+    let b = Volume::open(&args.b, 0, &args.raw, &cancel)?;
+    let d = compare(&a, &b, &cancel)?;
+    if args.json {
+        messages::result_json(&d.json())?;
+    } else {
+        messages::result(&d.text())?;
+    }
+    match args.max_rmse {
+        // Not a number is beyond every bound.
+        Some(bound) if d.rmse.is_nan() || d.rmse > bound => {
+            messages::note(&format!("rmse {} is beyond the bound {}", human::number(d.rmse), human::number(bound)));
+            Ok(ExitCode::from(1))
+        }
+        _ => Ok(ExitCode::SUCCESS),
+    }
+}
+
+/// Streams both volumes, plane by plane and component by component.
+pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
+    let (ia, ib) = (a.info(), b.info());
+    if ia.shape != ib.shape {
+        let message = format!(
+            "{} has {} voxels, {} has {}; expected equal shapes",
+            a.path.display(),
+            human::extent(ia.shape),
+            b.path.display(),
+            human::extent(ib.shape)
+        );
+        return Err(usage("B", message));
+    }
+    if ia.components != ib.components {
+        let message = format!("A has {} channels, B has {}; expected as many", ia.components, ib.components);
+        return Err(usage("B", message));
+    }
+    let components = ia.components.max(1);
+    let range = match a.attributes.is_openness() {
+        true => 1.0,
+        false => value_range(a, components, cancel)?,
+    };
+    let mut sums = Sums::default();
+    let mut plane = [0, 1].map(|_| vec![0.0; ia.shape[1] * ia.shape[2]]);
+    for component in 0..components {
+        let (mut pa, mut pb) = (a.planes(component)?, b.planes(component)?);
+        let mut similarity = Similarity::new([ia.shape[1], ia.shape[2]], range);
+        loop {
+            cancel.check()?;
+            let [va, vb] = &mut plane;
+            if !(pa.next(va)? && pb.next(vb)?) {
+                break;
+            }
+            sums.add(va, vb);
+            similarity.push(va, vb);
+        }
+        sums.similar(similarity.finish());
+    }
+    Ok(sums.finish())
+}
+
+/// Largest minus least value of all components.
+fn value_range(volume: &Volume, components: usize, cancel: &Cancel) -> Result<f64> {
+    let mut all = Moments::default();
+    for component in 0..components {
+        let mut planes = volume.planes(component)?;
+        let mut plane = vec![0.0; planes.plane_voxels()];
+        while planes.next(&mut plane)? {
+            cancel.check()?;
+            all = all.merge(Moments::of(&plane));
+        }
+    }
+    Ok(if all.max > all.min { all.max - all.min } else { 0.0 })
+}
+
+/// Running sums over pairs.
+#[derive(Default)]
+struct Sums {
+    /// Of A - B; its mean is the bias.
+    signed: Moments,
+    absolute: f64,
+    squares: f64,
+    max_abs: f64,
+    magnitudes: Magnitudes,
+    /// Sum of window values and how many there are.
+    similarity: (f64, u64),
+}
+
+impl Sums {
+    fn add(&mut self, a: &[f64], b: &[f64]) {
+        let difference: Vec<f64> = a.iter().zip(b).map(|(a, b)| if a == b { 0.0 } else { a - b }).collect();
+        // Sums per plane, so that long volumes lose no digits.
+        let (mut absolute, mut squares) = (0.0, 0.0);
+        for d in difference.iter().filter(|d| !d.is_nan()) {
+            let magnitude = d.abs();
+            absolute += magnitude;
+            squares += magnitude * magnitude;
+            self.max_abs = self.max_abs.max(magnitude);
+            self.magnitudes.add(magnitude);
+        }
+        self.absolute += absolute;
+        self.squares += squares;
+        self.signed = self.signed.merge(Moments::of(&difference));
+    }
+
+    fn similar(&mut self, (mean, windows): (f64, u64)) {
+        if windows > 0 {
+            self.similarity.0 += mean * windows as f64;
+            self.similarity.1 += windows;
+        }
+    }
+
+    fn finish(self) -> Difference {
+        let n = self.signed.n + self.signed.infinite;
+        let mean = |sum: f64| if n == 0 { f64::NAN } else { sum / n as f64 };
+        Difference {
+            rmse: mean(self.squares).sqrt(),
+            mae: mean(self.absolute),
+            bias: if self.signed.infinite > 0 || n == 0 { f64::NAN } else { self.signed.mean },
+            max_abs: if n == 0 { f64::NAN } else { self.max_abs },
+            p99: self.magnitudes.quantile(0.99),
+            ssim: (self.similarity.1 > 0).then(|| self.similarity.0 / self.similarity.1 as f64),
+            n,
+        }
+    }
+}
+
+impl Difference {
+    /// Numbers by name; what is not finite becomes null.
+    pub fn json(&self) -> serde_json::Value {
+        json!({
+            "rmse": self.rmse, "mae": self.mae, "bias": self.bias, "max_abs": self.max_abs, "p99": self.p99,
+            "ssim": self.ssim, "n": self.n,
+        })
+    }
+
+    /// A line per number.
+    pub fn text(&self) -> String {
+        let ssim = self.ssim.map_or("none (no whole window)".to_string(), |s| format!("{s:.6}"));
+        let [rmse, mae, bias, max_abs, p99] =
+            [self.rmse, self.mae, self.bias, self.max_abs, self.p99].map(human::number);
+        format!(
+            "rmse    {rmse}\nmae     {mae}\nbias    {bias}\nmax_abs {max_abs}\np99     {p99}\nssim    {ssim}\nn       {}",
+            self.n
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_skip_missing_voxels_and_count_the_rest() {
+        let mut s = Sums::default();
+        s.add(&[1.0, 2.0, f64::NAN, 4.0], &[1.0, 1.0, 5.0, 7.0]);
+        s.add(&[0.0, f64::NAN], &[f64::NAN, 0.0]);
+        s.similar((0.5, 2));
+        s.similar((1.0, 2));
+        s.similar((f64::NAN, 0));
+        let d = s.finish();
+        assert_eq!(d.n, 3);
+        assert!((d.rmse - (10.0f64 / 3.0).sqrt()).abs() < 1e-15);
+        assert!((d.mae - 4.0 / 3.0).abs() < 1e-15);
+        assert!((d.bias + 2.0 / 3.0).abs() < 1e-15);
+        assert_eq!((d.max_abs, d.p99, d.ssim), (3.0, 3.0, Some(0.75)));
+        let nothing = Sums::default().finish();
+        assert!(nothing.rmse.is_nan() && nothing.ssim.is_none() && nothing.n == 0);
+    }
+
+    #[test]
+    fn equal_infinities_are_equal() {
+        let mut s = Sums::default();
+        s.add(&[f64::INFINITY, 1.0], &[f64::INFINITY, 1.0]);
+        let d = s.finish();
+        assert_eq!((d.n, d.rmse, d.bias), (2, 0.0, 0.0));
+        let mut s = Sums::default();
+        s.add(&[f64::INFINITY], &[1.0]);
+        assert_eq!(s.finish().rmse, f64::INFINITY);
+    }
+}

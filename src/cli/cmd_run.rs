@@ -1,0 +1,62 @@
+//! `occlude run`.
+
+use super::args::RunArgs;
+use super::progress::Shown;
+use super::{human, load, messages, usage, write_whole};
+use crate::run::{self, Report, RunOptions};
+use crate::{Error, Result};
+
+/// Runs the job and says what was done, on stderr; the report goes to its file.
+pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
+    let config = load(&args.config, &[])?;
+    for (flag, path) in [("--report", &args.report), ("--trace", &args.trace)] {
+        // Found out now rather than after hours.
+        let folder = path.as_ref().and_then(|p| p.parent()).filter(|p| !p.as_os_str().is_empty());
+        if folder.is_some_and(|f| !f.is_dir()) || path.as_ref().is_some_and(|p| p.is_dir()) {
+            let path = path.as_ref().map(|p| p.display().to_string()).unwrap_or_default();
+            return Err(usage(flag, format!("got {path}; expected a file in an existing folder")));
+        }
+    }
+    let options = RunOptions {
+        resume: args.resume,
+        overwrite: args.overwrite,
+        no_skip: args.no_skip,
+        trace: args.trace.clone(),
+        cancel: messages::interrupts(),
+    };
+    let progress = Shown::new(quiet);
+    let report = run::run(&config, &options, &progress);
+    progress.finish();
+    let report = report.map_err(|e| e.located(&config.file, None))?;
+    if let Some(path) = &args.report {
+        let json = serde_json::to_vec_pretty(&report).map_err(|e| Error::Failed(format!("report: {e}")))?;
+        write_whole(path, &json)?;
+    }
+    if !quiet {
+        messages::note(&summary(&report));
+    }
+    Ok(())
+}
+
+/// One line for people.
+pub fn summary(r: &Report) -> String {
+    let skipped: u64 = r.bricks.skipped.values().sum();
+    let mut parts = vec![format!("{} of {} bricks computed", r.bricks.computed, r.bricks.total)];
+    if r.bricks.resumed > 0 {
+        parts.push(format!("{} resumed", r.bricks.resumed));
+    }
+    if skipped > 0 {
+        parts.push(format!("{skipped} skipped"));
+    }
+    format!(
+        "done in {}: {} voxels, {} voxels/s; {}; read {}, wrote {}; peak memory {} of {}",
+        human::seconds(r.seconds),
+        human::count(r.voxels as f64),
+        human::count(r.voxels_per_second),
+        parts.join(", "),
+        human::bytes(r.bytes_read),
+        human::bytes(r.bytes_written),
+        human::bytes(r.peak_memory_bytes),
+        human::bytes(r.memory_budget_bytes),
+    )
+}

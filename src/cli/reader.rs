@@ -1,0 +1,343 @@
+//! Volumes for commands that look at all of one or at a few slices: planes of scaled `f64` values, missing voxels as NaN.
+//!
+//! Planes are read in order. A chunked volume is decoded one row of chunks at a time (all chunks of one z index) and kept
+//! as decoded, in its stored type; so nothing is decoded twice, and memory is one such row.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rayon::prelude::*;
+
+use super::args::RawArgs;
+use super::attributes::{self, Attributes};
+use super::{messages, usage};
+use crate::brick::Voxels;
+use crate::config::{Input, InputKind, Place, RawFormat, Select};
+use crate::grid::{Affine, DType, Region, Shape, Voxel};
+use crate::run::Cancel;
+use crate::store::source::ChunkRead;
+use crate::store::{Source, VolumeInfo};
+use crate::{Error, Result, with_voxels};
+
+/// More voxels than this are not held at once.
+const MAX_HELD: usize = 1 << 31;
+
+/// An open volume with what is known about its values.
+pub struct Volume {
+    pub path: PathBuf,
+    pub source: Source,
+    pub attributes: Attributes,
+    /// Stored to scaled values: the recorded value range where there is one, else the file's slope and intercept.
+    pub affine: Affine,
+    /// Dropped last: folders with unpacked data.
+    _scratch: Option<Scratch>,
+}
+
+/// A folder that goes away with its owner.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new() -> Result<Scratch> {
+        static COUNT: AtomicU64 = AtomicU64::new(0);
+        let name = format!("occlude-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let path = std::env::temp_dir().join(name);
+        std::fs::create_dir(&path).map_err(|e| Error::file(&path, format!("cannot make a folder for scratch: {e}")))?;
+        Ok(Scratch(path))
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// The input that a path on the command line means: all channels, first time step.
+fn input(path: &Path, level: usize, raw: &RawArgs) -> Result<Input> {
+    let headerless = match (raw.shape, raw.dtype) {
+        (Some(shape), Some(dtype)) => {
+            Some(RawFormat { shape, dtype, big_endian: raw.big_endian, offset: raw.offset, trailing_ignore: false })
+        }
+        (None, None) => None,
+        _ => return Err(usage("--shape", "a headerless volume needs both --shape and --dtype")),
+    };
+    Ok(Input {
+        name: path.display().to_string(),
+        place: Place::default(),
+        kind: InputKind::Path { path: path.to_path_buf(), raw: headerless },
+        level,
+        array: None,
+        channel: Select::All,
+        time: Select::Index(0),
+        spacing: None,
+        unit: None,
+        origin: None,
+        slope: None,
+        intercept: None,
+        nodata: None,
+    })
+}
+
+impl Volume {
+    /// Opens a volume and makes its voxels readable (gzip is unpacked into a temporary folder).
+    pub fn open(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
+        let attributes = attributes::read(path);
+        let mut source = Source::open(&described(path, level, raw, &attributes)?)?;
+        if attributes.complete() == Some(false) {
+            messages::warning(&format!("{}: this output was not finished", path.display()));
+        }
+        let scratch = if source.spool_bytes() > 0 { Some(Scratch::new()?) } else { None };
+        let folder = scratch.as_ref().map_or_else(std::env::temp_dir, |s| s.0.clone());
+        source.prepare(&folder, &|_| !cancel.is_cancelled())?;
+        cancel.check()?;
+        Ok(Volume::new(path, source, attributes, scratch))
+    }
+
+    fn new(path: &Path, source: Source, attributes: Attributes, scratch: Option<Scratch>) -> Volume {
+        let info = source.info();
+        let affine = recorded(info.dtype, &attributes).unwrap_or(info.affine);
+        Volume { path: path.to_path_buf(), source, attributes, affine, _scratch: scratch }
+    }
+
+    pub fn info(&self) -> &VolumeInfo {
+        self.source.info()
+    }
+
+    pub fn planes(&self, component: usize) -> Result<Planes<'_>> {
+        Planes::new(&self.source, self.affine, component)
+    }
+}
+
+/// [`input`] of a path with what is known beside it.
+pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attributes) -> Result<Input> {
+    input(path, level, &describe(path, raw, attributes))
+}
+
+/// A headerless output of this program: shape and type stand in the file beside it.
+fn describe(path: &Path, given: &RawArgs, attributes: &Attributes) -> RawArgs {
+    let raw_name = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("raw"));
+    let Some(occlude) = attributes.occlude.as_ref().filter(|_| raw_name && given.shape.is_none()) else {
+        return given.clone();
+    };
+    let sizes = occlude.get("shape").and_then(|s| s.as_array());
+    let sizes = sizes.map(|s| s.iter().filter_map(|n| n.as_u64()).map(|n| n as usize).collect::<Vec<_>>());
+    let dtype = occlude.get("dtype").and_then(|d| d.as_str()).and_then(DType::parse);
+    match (sizes.and_then(|s| <[usize; 3]>::try_from(s).ok()), given.dtype.or(dtype)) {
+        (Some(shape), Some(dtype)) => RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() },
+        _ => given.clone(),
+    }
+}
+
+/// Codes of an integer output to values.
+fn recorded(dtype: DType, attributes: &Attributes) -> Option<Affine> {
+    let [lo, hi] = attributes.value_range().filter(|_| matches!(dtype, DType::U8 | DType::U16))?;
+    Some(Affine { slope: (hi - lo) / dtype.range().1, intercept: lo })
+}
+
+/// Decoded chunks of one z index.
+struct ChunkRow {
+    z: i64,
+    /// Chunks per axis y and x; x fastest below.
+    grid: [usize; 2],
+    chunks: Vec<Chunk>,
+}
+
+enum Chunk {
+    Missing(f64),
+    Data(Voxels),
+}
+
+/// The planes of one component, in order.
+pub struct Planes<'a> {
+    source: &'a Source,
+    to_value: ToValue,
+    component: usize,
+    shape: Shape,
+    next: usize,
+    row: Option<ChunkRow>,
+    stored: Voxels,
+}
+
+/// Stored to scaled values, missing ones to NaN.
+#[derive(Clone, Copy)]
+struct ToValue {
+    affine: Affine,
+    nodata: Option<f64>,
+}
+
+impl ToValue {
+    fn apply<T: Voxel>(self, stored: &[T], values: &mut [f64]) {
+        for (value, s) in values.iter_mut().zip(stored) {
+            let s = s.to_f64();
+            *value = if self.nodata == Some(s) { f64::NAN } else { self.affine.apply(s) };
+        }
+    }
+
+    fn one(self, stored: f64) -> f64 {
+        if self.nodata == Some(stored) { f64::NAN } else { self.affine.apply(stored) }
+    }
+}
+
+/// Voxels of a box, or the refusal to hold so many.
+fn held(shape: Shape) -> Result<usize> {
+    let voxels = shape.iter().try_fold(1usize, |n, &e| n.checked_mul(e)).filter(|&n| n <= MAX_HELD);
+    voxels.ok_or_else(|| {
+        Error::Failed(format!(
+            "{} voxels are too many to hold at once; a coarser level may do",
+            super::human::extent(shape)
+        ))
+    })
+}
+
+impl<'a> Planes<'a> {
+    fn new(source: &'a Source, affine: Affine, component: usize) -> Result<Planes<'a>> {
+        let info = source.info();
+        let [_, y, x] = info.shape;
+        let plane = held([1, y, x])?;
+        let stored = Voxels::zeroed(info.dtype, if info.chunk.is_none() { plane } else { 0 });
+        let to_value = ToValue { affine, nodata: info.nodata };
+        Ok(Planes { source, to_value, component, shape: info.shape, next: 0, row: None, stored })
+    }
+
+    /// Values of one plane.
+    pub fn plane_voxels(&self) -> usize {
+        self.shape[1] * self.shape[2]
+    }
+
+    /// Fills `plane` (y rows of x) with the next plane; false after the last.
+    pub fn next(&mut self, plane: &mut [f64]) -> Result<bool> {
+        let [nz, ny, nx] = self.shape;
+        let z = self.next;
+        if z >= nz {
+            return Ok(false);
+        }
+        let region = Region::new([z as i64, 0, 0], [z as i64 + 1, ny as i64, nx as i64]);
+        match self.source.info().chunk {
+            None => {
+                self.source.read(self.component, region, self.stored.view_mut([1, ny, nx]))?;
+                let to_value = self.to_value;
+                with_voxels!(&self.stored, v => to_value.apply(v, plane));
+                self.source.release(region);
+            }
+            Some(chunk) => {
+                let row = (z / chunk[0]) as i64;
+                if self.row.as_ref().is_none_or(|r| r.z != row) {
+                    self.row = None;
+                    self.row = Some(self.decode(row, chunk)?);
+                }
+                if let Some(row) = &self.row {
+                    copy_plane(row, chunk, z % chunk[0], [ny, nx], self.to_value, plane);
+                }
+            }
+        }
+        self.next += 1;
+        Ok(true)
+    }
+
+    fn decode(&self, z: i64, chunk: Shape) -> Result<ChunkRow> {
+        let grid = [self.shape[1].div_ceil(chunk[1]), self.shape[2].div_ceil(chunk[2])];
+        held([chunk[0], grid[0] * chunk[1], grid[1] * chunk[2]])?;
+        let one = |i: usize| decode_chunk(self.source, self.component, [z, (i / grid[1]) as i64, (i % grid[1]) as i64]);
+        let chunks = (0..grid[0] * grid[1]).into_par_iter().map(one).collect::<Result<Vec<_>>>()?;
+        Ok(ChunkRow { z, grid, chunks })
+    }
+}
+
+fn decode_chunk(source: &Source, component: usize, index: [i64; 3]) -> Result<Chunk> {
+    let info = source.info();
+    let voxels = held(info.chunk.unwrap_or(info.shape))?;
+    let mut data = Voxels::zeroed(info.dtype, voxels);
+    Ok(match source.read_chunk(component, index, &mut data)? {
+        ChunkRead::Missing(value) => Chunk::Missing(value),
+        ChunkRead::Data { .. } => Chunk::Data(data),
+    })
+}
+
+/// Plane `z` inside a row of chunks.
+fn copy_plane(row: &ChunkRow, chunk: Shape, z: usize, [ny, nx]: [usize; 2], to_value: ToValue, plane: &mut [f64]) {
+    for (y, line) in plane.chunks_exact_mut(nx).take(ny).enumerate() {
+        for (cx, part) in line.chunks_mut(chunk[2]).enumerate() {
+            match &row.chunks[(y / chunk[1]) * row.grid[1] + cx] {
+                Chunk::Missing(value) => part.fill(to_value.one(*value)),
+                Chunk::Data(voxels) => {
+                    let start = (z * chunk[1] + y % chunk[1]) * chunk[2];
+                    with_voxels!(voxels, v => to_value.apply(&v[start..start + part.len()], part));
+                }
+            }
+        }
+    }
+}
+
+/// Scaled values of a box inside the volume; for a few slices, since chunks are not kept.
+pub fn read_box(volume: &Volume, component: usize, region: Region) -> Result<Vec<f64>> {
+    let info = volume.info();
+    let shape = region.shape();
+    let mut values = vec![0.0; held(shape)?];
+    let to_value = ToValue { affine: volume.affine, nodata: info.nodata };
+    let Some(chunk) = info.chunk else {
+        let mut stored = Voxels::zeroed(info.dtype, values.len());
+        volume.source.read(component, region, stored.view_mut(shape))?;
+        with_voxels!(&stored, v => to_value.apply(v, &mut values));
+        return Ok(values);
+    };
+    for index in region.cells([0; 3], chunk).iter() {
+        let decoded = decode_chunk(&volume.source, component, index)?;
+        let cell = Region::of_cell(index, [0; 3], chunk);
+        let part = cell.clip(&region);
+        let (from, to) = (cell.offset_of(&part), region.offset_of(&part));
+        let [pz, py, px] = part.shape();
+        for (z, y) in (0..pz).flat_map(|z| (0..py).map(move |y| (z, y))) {
+            let at = ((to[0] + z) * shape[1] + to[1] + y) * shape[2] + to[2];
+            let target = &mut values[at..at + px];
+            match &decoded {
+                Chunk::Missing(value) => target.fill(to_value.one(*value)),
+                Chunk::Data(voxels) => {
+                    let start = ((from[0] + z) * chunk[1] + from[1] + y) * chunk[2] + from[2];
+                    with_voxels!(voxels, v => to_value.apply(&v[start..start + px], target));
+                }
+            }
+        }
+    }
+    Ok(values)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn planes_come_out_of_chunks_whole() {
+        // 3 x 5 voxels in chunks of [2, 2, 3]; plane 1 of the row.
+        let chunk = [2, 2, 3];
+        let at = |z: usize, y: usize, x: usize| (100 * z + 10 * y + x) as u16;
+        let data = |cy: usize, cx: usize| {
+            let voxel = |i: usize| at(i / 6, cy * 2 + i / 3 % 2, cx * 3 + i % 3);
+            Chunk::Data(Voxels::U16((0..12).map(voxel).collect()))
+        };
+        let chunks = vec![data(0, 0), data(0, 1), Chunk::Missing(7.0), data(1, 1)];
+        let row = ChunkRow { z: 0, grid: [2, 2], chunks };
+        let to_value = ToValue { affine: Affine { slope: 2.0, intercept: 1.0 }, nodata: Some(113.0) };
+        let mut plane = vec![0.0; 15];
+        copy_plane(&row, chunk, 1, [3, 5], to_value, &mut plane);
+        for (i, value) in plane.iter().enumerate() {
+            let (y, x) = (i / 5, i % 5);
+            let stored = if y == 2 && x < 3 { 7.0 } else { f64::from(at(1, y, x)) };
+            if stored == 113.0 {
+                assert!(value.is_nan());
+            } else {
+                assert_eq!(*value, 2.0 * stored + 1.0, "{y} {x}");
+            }
+        }
+    }
+
+    #[test]
+    fn recorded_ranges_are_for_codes_only() {
+        let attributes =
+            Attributes { occlude: Some(serde_json::json!({"value_range": [-1.0, 1.0]})), datasets: Vec::new() };
+        assert_eq!(recorded(DType::U8, &attributes).unwrap().apply(255.0), 1.0);
+        assert_eq!(recorded(DType::U16, &attributes).unwrap().apply(0.0), -1.0);
+        assert_eq!(recorded(DType::F32, &attributes), None);
+        assert_eq!(recorded(DType::U8, &Attributes::default()), None);
+        assert!(held([1 << 20, 1 << 20, 1 << 20]).is_err());
+    }
+}
