@@ -74,7 +74,7 @@ fn tolerance(input: DType, channel: WindowChannel, exact: f64, mean: f64) -> f64
     match channel {
         WindowChannel::Openness(..) => 3e-6,
         WindowChannel::Variance | WindowChannel::Std if input.is_float() => 1e-6 * exact.abs() + least,
-        WindowChannel::Moment2 => unit * exact.abs().max(mean * mean) * 2.0 + least,
+        WindowChannel::Moment2 => unit * exact.abs().max(mean * mean) * 4.0 + least,
         WindowChannel::Mean => unit * mean + least,
         _ => unit * exact.abs() + least,
     }
