@@ -101,6 +101,17 @@ impl Metrics {
         (self.steps[step].0.load(Relaxed) as f64 * 1e-9, self.steps[step].1.load(Relaxed))
     }
 
+    /// Takes in what a pre-pass counted, except its bricks.
+    pub fn absorb(&self, other: &Metrics) {
+        self.bytes_read(other.bytes_read.load(Relaxed));
+        self.read_ns.fetch_add(other.read_ns.load(Relaxed), Relaxed);
+        self.peak.fetch_max(other.peak.load(Relaxed), Relaxed);
+        for (mine, theirs) in self.steps.iter().zip(&other.steps) {
+            mine.0.fetch_add(theirs.0.load(Relaxed), Relaxed);
+            mine.1.fetch_add(theirs.1.load(Relaxed), Relaxed);
+        }
+    }
+
     /// Bricks and voxels done.
     pub fn done(&self) -> (u64, u64) {
         (self.bricks_done.load(Relaxed), self.voxels_done.load(Relaxed))

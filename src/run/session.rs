@@ -17,10 +17,10 @@ use super::prepass::MinMax;
 use super::program::Program;
 use super::read::Reader;
 use super::report::{Report, StageReport};
+use super::second;
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
-use super::second;
 use crate::brick::{Pool, Scratch};
 use crate::config::{Config, config_hash};
 use crate::grid::{Region, order::morton};
@@ -214,17 +214,17 @@ impl<'a> Session<'a> {
             slots.push(TaskSlot::new(task, region, bricks.len()));
             work.extend(bricks.into_iter().map(|brick| Work { brick, slot: slots.len() - 1 }));
         }
-        let assembler = Assembler {
-            plan: &self.plan,
-            group,
-            targets: &self.targets,
-            pool: &self.pool,
-            level: engine.level,
-        };
+        let assembler =
+            Assembler { plan: &self.plan, group, targets: &self.targets, pool: &self.pool, level: engine.level };
         let deliver =
             |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
         let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items);
-        self.stream(&engine, &program, &group.brick, &work, &deliver, &write)
+        let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
+        let tick = || {
+            let (bricks, voxels) = self.metrics.done();
+            self.tick(&group.brick, [voxels, self.plan.voxels(), bricks, total], "compute");
+        };
+        self.stream(&engine, &program, &group.brick, &work, &self.metrics, &deliver, &write, &tick)
     }
 
     fn engine(&self) -> Engine<'_> {
@@ -272,7 +272,17 @@ impl<'a> Session<'a> {
             found.add(&self.plan, &prepass.wires, done);
             Ok(Vec::new())
         };
-        self.stream(&engine, &program, &group.brick, &work, &deliver, &|_, _| Ok(()))?;
+        let metrics = Metrics::new(self.plan.graph.steps.len());
+        let tick = || {
+            let (bricks, voxels) = metrics.done();
+            self.tick(
+                &group.brick,
+                [voxels, lattice.shape.iter().product::<usize>() as u64, bricks, work.len() as u64],
+                "pre-pass",
+            );
+        };
+        self.stream(&engine, &program, &group.brick, &work, &metrics, &deliver, &|_, _| Ok(()), &tick)?;
+        self.metrics.absorb(&metrics);
         Ok(found.result(prepass.kind))
     }
 
@@ -283,18 +293,14 @@ impl<'a> Session<'a> {
         program: &Program,
         brick: &BrickChoice,
         work: &[Work],
+        metrics: &Metrics,
         deliver: &(dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync),
         write: &(dyn Fn(Work, Vec<Item>) -> Result<()> + Sync),
+        tick: &(dyn Fn() + Sync),
     ) -> Result<()> {
         let cache = ChunkCache::new(brick.cache);
-        let reader = Reader {
-            engine,
-            program,
-            sources: &self.sources,
-            cache: &cache,
-            uses: self.uses(program, work),
-            metrics: &self.metrics,
-        };
+        let reader =
+            Reader { engine, program, sources: &self.sources, cache: &cache, uses: self.uses(program, work), metrics };
         let stream = Stream {
             reader: &reader,
             work,
@@ -303,12 +309,12 @@ impl<'a> Session<'a> {
             brick_voxels: brick.shape.iter().map(|&n| n as u64).product(),
             threads: self.plan.threads,
             pool: &self.threads,
-            metrics: &self.metrics,
+            metrics,
             trace: &self.trace,
             cancel: &self.options.cancel,
             deliver,
             write,
-            tick: &|| self.tick(brick),
+            tick,
         };
         stream.run()
     }
@@ -339,18 +345,16 @@ impl<'a> Session<'a> {
     }
 
     /// After each brick: pages of mapped inputs behind the front are let go, the pool is kept small, progress is told.
-    fn tick(&self, brick: &BrickChoice) {
+    fn tick(&self, brick: &BrickChoice, [voxels, of_voxels, bricks, of_bricks]: [u64; 4], phase: &str) {
         let now = (self.metrics.seconds() * 1e3) as u64;
         let last = self.last_tick.load(Ordering::Relaxed);
-        let (bricks, voxels) = self.metrics.done();
-        let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
-        let due = now >= last + 100 || bricks == total;
+        let due = now >= last + 100 || bricks == of_bricks;
         if due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok() {
             self.pool.trim((brick.bytes * brick.in_flight as u64 / 2) as usize);
             for source in &self.sources {
                 source.release(Region::whole(source.info().shape));
             }
-            self.progress.update(voxels, self.plan.voxels(), bricks, total, "compute");
+            self.progress.update(voxels, of_voxels, bricks, of_bricks, phase);
         }
     }
 
