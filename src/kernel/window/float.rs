@@ -28,14 +28,14 @@ impl Float for f64 {
 }
 
 /// Columns that go through z together: their lines and first tree level stay in L1.
-const COLUMNS: usize = 64;
+const COLUMNS: usize = 256;
 
 /// Bytes of scratch.
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
     let rows = padded::<T>(2 * job.pitch) + 2 * padded::<T>(job.tile[1]);
-    Emit::bytes(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
+    Emit::bytes(job.tile[1]) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
 }
 
 /// Moments on their way through the three axes.
@@ -117,8 +117,12 @@ pub fn run<T: Float>(
     let out_lo = cut::<T>(bytes, k * job.tile[1]);
     let out_hi = cut::<T>(bytes, k * job.tile[1]);
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
+    let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
     for tile in Tile::all(job) {
+        for (x, c) in columns[..tile.size[1]].iter_mut().enumerate() {
+            *c = job.count(2, tile.x + x) as f64;
+        }
         lo.fill(T::GREATEST);
         hi.fill(T::LEAST);
         b.planes.clear();
@@ -156,8 +160,8 @@ pub fn run<T: Float>(
                     let len = v.len();
                     if needs.mean && !wanted.variance && !counts {
                         let section = job.count(0, z) * job.count(1, y);
-                        for (i, n) in emit.numerator[..len].iter_mut().enumerate() {
-                            *n = (section * job.count(2, tile.x + i)) as f64;
+                        for (n, c) in emit.numerator[..len].iter_mut().zip(&*columns) {
+                            *n = section as f64 * c;
                         }
                     } else if needs.mean {
                         emit.numerator[..len].copy_from_slice(&b.row.n[..len]);
