@@ -5,7 +5,7 @@ use super::emit::{Emit, polarity, put_moment, put_openness, repair, spread_of};
 use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, rows_extremes};
 use super::lines::{self, Add, Coding, Elem, Hi, Lines, Lo, Masked, Op, Sources};
-use super::merge::{Moments, Sum, Wanted, tree_merge};
+use super::merge::{Moments, Sum, Wanted, gather, grow, tree_merge};
 use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
 use super::{Context, WindowOut};
 use crate::grid::{AnyViewMut, Shape, View};
@@ -28,22 +28,20 @@ impl Float for f64 {
 }
 
 /// Columns that go through z together: their lines and first tree level stay in L1.
-const COLUMNS: usize = 64;
+const COLUMNS: usize = 256;
 
 /// Bytes of scratch.
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
     let rows = padded::<T>(2 * job.pitch) + 2 * padded::<T>(job.tile[1]);
-    Emit::bytes(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
+    Emit::bytes(job.tile[1]) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
 }
 
 /// Moments on their way through the three axes.
 struct Buffers<'a, A> {
-    /// One strip of [`COLUMNS`] through z: its lines, tree and results.
-    strip: Moments<'a, A>,
+    /// The tree of one strip of [`COLUMNS`] through z.
     strip_work: Moments<'a, A>,
-    strip_out: Moments<'a, A>,
     /// Planes of a batch after z.
     planes: Moments<'a, A>,
     /// One plane through y.
@@ -55,14 +53,12 @@ struct Buffers<'a, A> {
 }
 
 impl<'a, A: Sum> Buffers<'a, A> {
-    fn lens(job: &Job) -> [usize; 8] {
+    fn lens(job: &Job) -> [usize; 6] {
         let [wz, wy, wx] = job.window;
         let tree = |w: usize, step: usize, len: usize| lines::tree_levels(w) * (len + w * step);
         let (z, y) = (job.batch * COLUMNS, job.tile[0] * job.pitch);
         [
-            z + wz * COLUMNS,
             tree(wz, COLUMNS, z),
-            z,
             job.batch * job.plane(),
             tree(wy, job.pitch, y),
             y,
@@ -72,9 +68,9 @@ impl<'a, A: Sum> Buffers<'a, A> {
     }
 
     fn cut(job: &Job, wanted: Wanted, bytes: &mut &'a mut [u8]) -> Self {
-        let [strip, strip_work, strip_out, planes, plane_work, rows, row_work, row] =
+        let [strip_work, planes, plane_work, rows, row_work, row] =
             Self::lens(job).map(|len| Moments::cut(len, wanted, bytes));
-        Buffers { strip, strip_work, strip_out, planes, plane_work, rows, row_work, row }
+        Buffers { strip_work, planes, plane_work, rows, row_work, row }
     }
 
     fn bytes(job: &Job) -> usize {
@@ -121,8 +117,12 @@ pub fn run<T: Float>(
     let out_lo = cut::<T>(bytes, k * job.tile[1]);
     let out_hi = cut::<T>(bytes, k * job.tile[1]);
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
+    let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
     for tile in Tile::all(job) {
+        for (x, c) in columns[..tile.size[1]].iter_mut().enumerate() {
+            *c = job.count(2, tile.x + x) as f64;
+        }
         lo.fill(T::GREATEST);
         hi.fill(T::LEAST);
         b.planes.clear();
@@ -160,8 +160,8 @@ pub fn run<T: Float>(
                     let len = v.len();
                     if needs.mean && !wanted.variance && !counts {
                         let section = job.count(0, z) * job.count(1, y);
-                        for (i, n) in emit.numerator[..len].iter_mut().enumerate() {
-                            *n = (section * job.count(2, tile.x + i)) as f64;
+                        for (n, c) in emit.numerator[..len].iter_mut().zip(&*columns) {
+                            *n = section as f64 * c;
                         }
                     } else if needs.mean {
                         emit.numerator[..len].copy_from_slice(&b.row.n[..len]);
@@ -245,7 +245,7 @@ fn planes_extremes<T: Float>(
     }
 }
 
-/// Moments over z of a batch of output planes, strip by strip.
+/// Moments over z of a batch of output planes, strip by strip, straight from `src`.
 fn planes_moments<T: Float>(
     level: Level,
     wanted: Wanted,
@@ -257,65 +257,194 @@ fn planes_moments<T: Float>(
 ) where
     Add: Op<T::Total>,
 {
+    let (w, len) = (job.window[0], job.batch * COLUMNS);
+    let (levels, pitch) = (lines::tree_levels(w), len + w * COLUMNS);
     let first = (job.at[0] + z0) as isize - job.radius[0] as isize;
     for j in tile.rows.0..tile.rows.1 {
-        let y = tile.rows.2 + j - tile.rows.0;
         for x in (tile.cols.0..tile.cols.1).step_by(COLUMNS) {
             let cols = COLUMNS.min(tile.cols.1 - x);
-            for k in 0..job.window[0] + job.batch - 1 {
-                let z = first + k as isize;
-                let mut line = b.strip.part(k * COLUMNS..(k + 1) * COLUMNS);
-                if (0..job.src[0] as isize).contains(&z) {
-                    let start = tile.cols.2 + x - tile.cols.0;
-                    load(level, wanted, &src.row_at(z as usize, y)[start..start + cols], &mut line);
-                } else {
-                    line.clear();
+            let corner = (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2 + x - tile.cols.0;
+            // Lines of voxels that exist: the others would add nothing.
+            let part = |from: usize, to: usize| {
+                let at = |i: usize| (first + i as isize).clamp(0, job.src[0] as isize) as usize;
+                Raw { src: src.data, base: corner, pitch: src.plane, lines: (at(from), at(to)) }
+            };
+            if levels > 0 {
+                for i in 0..job.batch + w - 4 {
+                    join_raw(
+                        level,
+                        wanted,
+                        part(i, i + 4),
+                        &mut b.strip_work.part(i * COLUMNS..i * COLUMNS + cols),
+                        false,
+                    );
                 }
+                grow(level, wanted, 2, None, w, COLUMNS, len, &mut b.strip_work);
             }
-            tree_merge(level, wanted, &b.strip, job.window[0], COLUMNS, &mut b.strip_out, &mut b.strip_work);
             for k in 0..job.batch {
-                let from = b.strip_out.part(k * COLUMNS..k * COLUMNS + cols);
                 let start = k * job.plane() + j * job.pitch + x;
-                b.planes.part(start..start + cols).copy_from(&from);
+                let out = &mut b.planes.part(start..start + cols);
+                let done = gather(level, wanted, None, w, COLUMNS, pitch, k * COLUMNS, out, &b.strip_work);
+                join_raw(level, wanted, part(k + done, k + w), out, done > 0);
             }
         }
     }
 }
 
-/// Moments of single voxels; the rest of the line has none.
-fn load<T: Float>(level: Level, wanted: Wanted, row: &[T], line: &mut Moments<T::Total>) {
-    load_sums(level, row, line.s);
-    if wanted.variance || wanted.counts {
-        load_counts(level, row, line.n);
+/// Lines of stored voxels, `lines` half-open.
+#[derive(Clone, Copy)]
+struct Raw<'a, T> {
+    src: &'a [T],
+    base: usize,
+    pitch: usize,
+    lines: (usize, usize),
+}
+
+/// Moments of up to 8 lines of stored voxels, the first level of a tree (or its last digit, `onto` the others).
+fn join_raw<T: Float>(level: Level, wanted: Wanted, raw: Raw<T>, out: &mut Moments<T::Total>, onto: bool)
+where
+    Add: Op<T::Total>,
+{
+    let Raw { src, base, pitch, lines } = raw;
+    if lines.0 >= lines.1 {
+        if !onto {
+            out.clear();
+        }
+        return;
     }
-    if wanted.variance {
-        line.m.fill(0.0);
-        line.i.copy_from_slice(line.n);
+    let rows = (&src[base + lines.0 * pitch..], pitch, lines.1 - lines.0);
+    match (wanted.variance, wanted.counts) {
+        (true, _) => raw_merges(level, rows, out.s, out.m, out.n, out.i, onto),
+        (false, true) => {
+            raw_sums(level, Masked::<true>, rows, out.s, onto);
+            raw_counts(level, rows, out.n, onto);
+        }
+        (false, false) => raw_sums(level, Masked::<false>, rows, out.s, onto),
     }
 }
 
 crate::multiversion! {
-    fn load_sums[T: Float](row: &[T], to: &mut [T::Total]) -> () = load_sums_inner;
+    fn raw_sums[T: Float, const M: bool](
+        masked: Masked<M>, rows: (&[T], usize, usize), out: &mut [T::Total], onto: bool
+    ) -> () = raw_sums_inner;
+}
+
+/// Value and count of a voxel.
+#[inline(always)]
+#[allow(clippy::eq_op)]
+fn weigh<T: Float>(v: T) -> (T::Total, f64) {
+    if v == v { (T::Total::of(v.to_f64()), 1.0) } else { (T::Total::default(), 0.0) }
 }
 
 #[inline(always)]
-#[allow(clippy::eq_op)]
-fn load_sums_inner<T: Float>(row: &[T], to: &mut [T::Total]) {
-    for (t, v) in to.iter_mut().zip(row) {
-        *t = T::Total::of(if *v == *v { v.to_f64() } else { 0.0 });
+fn raw_sums_inner<T: Float, const M: bool>(
+    _: Masked<M>,
+    (src, pitch, count): (&[T], usize, usize),
+    out: &mut [T::Total],
+    onto: bool,
+) {
+    let value = |v: T| if M { weigh(v).0 } else { T::Total::of(v.to_f64()) };
+    let len = out.len();
+    if count == 4 && !onto {
+        let [a, b, c, d]: [&[T]; 4] = std::array::from_fn(|k| &src[k * pitch..k * pitch + len]);
+        for i in 0..len {
+            out[i] = value(a[i]).plus(value(b[i])).plus(value(c[i])).plus(value(d[i]));
+        }
+        return;
     }
-    to[row.len()..].fill(T::Total::default());
+    for k in 0..count {
+        let row = &src[k * pitch..k * pitch + len];
+        if k == 0 && !onto {
+            for (o, v) in out.iter_mut().zip(row) {
+                *o = value(*v);
+            }
+        } else {
+            for (o, v) in out.iter_mut().zip(row) {
+                *o = o.plus(value(*v));
+            }
+        }
+    }
 }
 
 crate::multiversion! {
-    fn load_counts[T: Float](row: &[T], to: &mut [f64]) -> () = load_counts_inner;
+    fn raw_counts[T: Float](rows: (&[T], usize, usize), out: &mut [f64], onto: bool) -> () = raw_counts_inner;
 }
 
 #[inline(always)]
-#[allow(clippy::eq_op)]
-fn load_counts_inner<T: Float>(row: &[T], to: &mut [f64]) {
-    for (t, v) in to.iter_mut().zip(row) {
-        *t = if *v == *v { 1.0 } else { 0.0 };
+fn raw_counts_inner<T: Float>((src, pitch, count): (&[T], usize, usize), out: &mut [f64], onto: bool) {
+    if !onto {
+        out.fill(0.0);
     }
-    to[row.len()..].fill(0.0);
+    for k in 0..count {
+        for (o, v) in out.iter_mut().zip(&src[k * pitch..]) {
+            *o += weigh(*v).1;
+        }
+    }
+}
+
+crate::multiversion! {
+    fn raw_merges[T: Float](
+        rows: (&[T], usize, usize), os: &mut [T::Total], om: &mut [f64], on: &mut [f64], oi: &mut [f64], onto: bool
+    ) -> () = raw_merges_inner;
+}
+
+/// [`super::merge`] with single voxels (M2 = 0) as terms, in the same order of operations.
+#[inline(always)]
+fn raw_merges_inner<T: Float>(
+    rows: (&[T], usize, usize),
+    os: &mut [T::Total],
+    om: &mut [f64],
+    on: &mut [f64],
+    oi: &mut [f64],
+    onto: bool,
+) {
+    macro_rules! arms {
+        ($($k:literal)*) => {
+            match (rows.2, onto) {
+                $(($k, false) => raw_merges_k::<T, $k, false>(rows.0, rows.1, os, om, on, oi),
+                  ($k, true) => raw_merges_k::<T, $k, true>(rows.0, rows.1, os, om, on, oi),)*
+                _ => unreachable!("one to eight lines"),
+            }
+        };
+    }
+    arms!(1 2 3 4 5 6 7 8)
+}
+
+#[inline(always)]
+fn raw_merges_k<T: Float, const K: usize, const ONTO: bool>(
+    src: &[T],
+    pitch: usize,
+    os: &mut [T::Total],
+    om: &mut [f64],
+    on: &mut [f64],
+    oi: &mut [f64],
+) {
+    let len = os.len();
+    let (om, on, oi) = (&mut om[..len], &mut on[..len], &mut oi[..len]);
+    assert!((K - 1) * pitch + len <= src.len());
+    for x in 0..len {
+        let (mut sum, mut total, mut square) = (T::Total::default(), 0.0, 0.0);
+        if ONTO {
+            (sum, total, square) = (os[x], on[x], om[x]);
+        }
+        for k in 0..K {
+            // SAFETY: compared with the length above.
+            let (s, n) = weigh(unsafe { *src.get_unchecked(k * pitch + x) });
+            (sum, total) = (sum.plus(s), total + n);
+        }
+        let i = 1.0 / total;
+        let i = if total > 0.0 { i } else { 0.0 };
+        let mean = sum.mean(total, i);
+        if ONTO {
+            let d = os[x].deviation(on[x], mean);
+            square = (d * d).mul_add(oi[x], square);
+        }
+        for k in 0..K {
+            // SAFETY: as above.
+            let (s, n) = weigh(unsafe { *src.get_unchecked(k * pitch + x) });
+            let d = s.deviation(n, mean);
+            square = (d * d).mul_add(n, square);
+        }
+        (os[x], om[x], on[x], oi[x]) = (sum, square, total, i);
+    }
 }

@@ -175,6 +175,28 @@ fn extremes_inner<T: Elem, const B: usize, const M: bool, const TWO: bool>(
     }
 }
 
+/// Joins line `start` of `src` to running extremes.
+#[inline(always)]
+fn join_line<T: Elem, const M: bool, const TWO: bool>(
+    (mut lo, mut hi): (T::Chunk, T::Chunk),
+    src: [&[T]; 2],
+    start: usize,
+    coding: Coding<T>,
+) -> (T::Chunk, T::Chunk) {
+    let chunk = T::CHUNK.as_ref().len();
+    let one = &src[0][start..start + chunk];
+    let two = if TWO { &src[1][start..start + chunk] } else { one };
+    let (l, h) = (lo.as_mut(), hi.as_mut());
+    for i in 0..chunk {
+        let v = one[i].code(coding.flip);
+        let u = if TWO { two[i].code(coding.flip) } else { v };
+        let gone = M && v == coding.missing;
+        l[i] = l[i].lo(if gone { T::GREATEST } else { v });
+        h[i] = h[i].hi(if gone { T::LEAST } else { u });
+    }
+    (lo, hi)
+}
+
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
@@ -188,40 +210,28 @@ fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
     out: (usize, usize),
 ) {
     let chunk = T::CHUNK.as_ref().len();
-    let join = |m: &mut (T::Chunk, T::Chunk), i: usize| {
-        let start = lines.start(i) + x;
-        let one = &src[0][start..start + chunk];
-        let two = if TWO { &src[1][start..start + chunk] } else { one };
-        let (lo, hi) = (m.0.as_mut(), m.1.as_mut());
-        for i in 0..chunk {
-            let v = one[i].code(coding.flip);
-            let u = if TWO { two[i].code(coding.flip) } else { v };
-            let gone = M && v == coding.missing;
-            lo[i] = lo[i].lo(if gone { T::GREATEST } else { v });
-            hi[i] = hi[i].hi(if gone { T::LEAST } else { u });
-        }
-    };
     let mut nothing = (T::CHUNK, T::CHUNK);
     nothing.0.as_mut().fill(T::GREATEST);
     nothing.1.as_mut().fill(T::LEAST);
     let mut core = nothing;
     for i in B - 1..w {
-        join(&mut core, i);
+        core = join_line::<T, M, TWO>(core, src, lines.start(i) + x, coding);
     }
     let mut left = [core; B];
     for k in (0..B - 1).rev() {
-        left[k] = left[k + 1];
-        join(&mut left[k], k);
+        left[k] = join_line::<T, M, TWO>(left[k + 1], src, lines.start(k) + x, coding);
     }
     let mut right = nothing;
-    for (k, l) in left.iter().enumerate() {
+    for k in 0..B {
         if k > 0 {
-            join(&mut right, w + k - 1);
+            right = join_line::<T, M, TWO>(right, src, lines.start(w + k - 1) + x, coding);
         }
         let start = out.0 + k * out.1 + x;
+        let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
+        let (l, r) = (left[k], right);
         for i in 0..chunk {
-            lo[start..start + chunk][i] = l.0.as_ref()[i].lo(right.0.as_ref()[i]);
-            hi[start..start + chunk][i] = l.1.as_ref()[i].hi(right.1.as_ref()[i]);
+            to_lo[i] = l.0.as_ref()[i].lo(r.0.as_ref()[i]);
+            to_hi[i] = l.1.as_ref()[i].hi(r.1.as_ref()[i]);
         }
     }
 }

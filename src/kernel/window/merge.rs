@@ -176,6 +176,119 @@ pub struct Wanted {
     pub counts: bool,
 }
 
+/// What [`Moments`] holds, for reading.
+#[derive(Clone, Copy)]
+pub struct Held<'a, A> {
+    s: &'a [A],
+    m: &'a [f64],
+    n: &'a [f64],
+    i: &'a [f64],
+}
+
+impl<'a, A: Sum> Moments<'a, A> {
+    pub fn held(&self) -> Held<'_, A> {
+        Held { s: self.s, m: self.m, n: self.n, i: self.i }
+    }
+
+    /// Splits in front of element `at`.
+    fn split(&mut self, at: usize) -> (Held<'_, A>, Moments<'_, A>) {
+        fn of<T>(s: &mut [T], at: usize) -> (&[T], &mut [T]) {
+            let (a, b) = s.split_at_mut(at.min(s.len()));
+            (a, b)
+        }
+        let ((s0, s1), (m0, m1)) = (of(self.s, at), of(self.m, at));
+        let ((n0, n1), (i0, i1)) = (of(self.n, at), of(self.i, at));
+        (Held { s: s0, m: m0, n: n0, i: i0 }, Moments { s: s1, m: m1, n: n1, i: i1 })
+    }
+}
+
+impl<A> Held<'_, A> {
+    /// The elements from `at` on.
+    fn tail(&self, at: usize) -> Self {
+        fn of<T>(s: &[T], at: usize) -> &[T] {
+            &s[at.min(s.len())..]
+        }
+        Held { s: of(self.s, at), m: of(self.m, at), n: of(self.n, at), i: of(self.i, at) }
+    }
+}
+
+/// Joins windows of `from` at `i + offset` for every offset, and what `out` holds if `onto`, into `out[i]`.
+fn join<A: Sum>(level: Level, wanted: Wanted, from: Held<A>, offsets: &[usize], out: &mut Moments<A>, onto: bool)
+where
+    Add: Op<A>,
+{
+    if wanted.variance {
+        merge_at(level, from.s, from.m, from.n, from.i, offsets, out.s, out.m, out.n, out.i, onto);
+        return;
+    }
+    lines::join_at(level, Add, from.s, offsets, out.s, onto);
+    if wanted.counts {
+        lines::join_at::<f64, Add>(level, Add, from.n, offsets, out.n, onto);
+    }
+}
+
+/// Levels `from..` of a tree over windows of `w` elements `step` apart for `len` outputs, `pitch` apart in `work`.
+/// Level 1 is joined from `src`, which only it needs.
+#[allow(clippy::too_many_arguments)]
+pub fn grow<A: Sum>(
+    level: Level,
+    wanted: Wanted,
+    first: usize,
+    src: Option<Held<A>>,
+    w: usize,
+    step: usize,
+    len: usize,
+    work: &mut Moments<A>,
+) where
+    Add: Op<A>,
+{
+    let pitch = len + w * step;
+    for k in first..=tree_levels(w) {
+        let size = step << (2 * (k - 1));
+        let (below, mut this) = work.split((k - 1) * pitch);
+        let from = if k == 1 { src.expect("level 1 needs voxels") } else { below.tail((k - 2) * pitch) };
+        let offsets = [0, size, 2 * size, 3 * size];
+        join(level, wanted, from, &offsets, &mut this.part(0..level_len(w, step, len, k)), false);
+    }
+}
+
+/// Windows for outputs `start..start + out.len()` from the levels of [`grow`], all but the last digit where `src` is
+/// `None`; returns how many elements of each window are joined.
+#[allow(clippy::too_many_arguments)]
+pub fn gather<A: Sum>(
+    level: Level,
+    wanted: Wanted,
+    src: Option<Held<A>>,
+    w: usize,
+    step: usize,
+    pitch: usize,
+    start: usize,
+    out: &mut Moments<A>,
+    work: &Moments<A>,
+) -> usize
+where
+    Add: Op<A>,
+{
+    let levels = tree_levels(w);
+    let mut at = 0;
+    for k in (0..=levels).rev() {
+        let size = 1 << (2 * k);
+        let digit = (w - at) / size;
+        let mut offsets = [0; 8];
+        for (j, o) in offsets[..digit].iter_mut().enumerate() {
+            *o = start + (at + j * size) * step;
+        }
+        let from = match (k, src) {
+            (0, None) => break,
+            (0, Some(src)) => src,
+            _ => work.held().tail((k - 1) * pitch),
+        };
+        join(level, wanted, from, &offsets[..digit], out, k < levels);
+        at += digit * size;
+    }
+    at
+}
+
 /// Moments of windows of `w` elements `step` apart, in an order that depends on `w` alone. `work` holds
 /// [`tree_levels`] levels of `out.s.len() + w * step` elements.
 pub fn tree_merge<A: Sum>(
@@ -189,110 +302,97 @@ pub fn tree_merge<A: Sum>(
 ) where
     Add: Op<A>,
 {
-    if !wanted.variance {
-        lines::tree_sum(level, src.s, w, step, out.s, work.s);
-        if wanted.counts {
-            lines::tree_sum::<f64>(level, src.n, w, step, out.n, work.n);
-        }
-        return;
-    }
-    let (levels, len) = (tree_levels(w), out.s.len());
-    let pitch = len + w * step;
-    let mut size = 1;
-    for k in 1..=levels {
-        let Moments { s, m, n, i } = work;
-        let cut = (k - 1) * pitch;
-        let ((s0, s1), (m0, m1)) = (s.split_at_mut(cut), m.split_at_mut(cut));
-        let ((n0, n1), (i0, i1)) = (n.split_at_mut(cut), i.split_at_mut(cut));
-        let below = cut.saturating_sub(pitch);
-        let from: From<A> = if k == 1 {
-            (src.s, src.m, src.n, src.i)
-        } else {
-            (&s0[below..], &m0[below..], &n0[below..], &i0[below..])
-        };
-        let l = level_len(w, step, len, k);
-        let offsets = [0, size * step, 2 * size * step, 3 * size * step];
-        merge_at(level, from, &offsets, (&mut s1[..l], &mut m1[..l], &mut n1[..l], &mut i1[..l]), false);
-        size *= 4;
-    }
-    let mut at = 0;
-    for k in (0..=levels).rev() {
-        let digit = (w - at) / size;
-        let mut offsets = [0; 8];
-        for (j, o) in offsets[..digit].iter_mut().enumerate() {
-            *o = (at + j * size) * step;
-        }
-        let r = k.saturating_sub(1) * pitch..k * pitch;
-        let from: From<A> = if k == 0 {
-            (src.s, src.m, src.n, src.i)
-        } else {
-            (&work.s[r.clone()], &work.m[r.clone()], &work.n[r.clone()], &work.i[r])
-        };
-        let to = (&mut *out.s, &mut *out.m, &mut *out.n, &mut *out.i);
-        merge_at(level, from, &offsets[..digit], to, k < levels);
-        at += digit * size;
-        size /= 4;
-    }
+    let len = out.s.len();
+    grow(level, wanted, 1, Some(src.held()), w, step, len, work);
+    gather(level, wanted, Some(src.held()), w, step, len + w * step, 0, out, work);
 }
 
-type From<'a, A> = (&'a [A], &'a [f64], &'a [f64], &'a [f64]);
-type Into<'a, A> = (&'a mut [A], &'a mut [f64], &'a mut [f64], &'a mut [f64]);
-
 crate::multiversion! {
-    /// Merges the windows of `from` at `i + offset` for every offset, and what `out` holds if `onto`, into `out[i]`.
-    fn merge_at[A: Sum](from: From<A>, offsets: &[usize], out: Into<A>, onto: bool) -> () = merge_at_inner;
+    fn merge_at[A: Sum](
+        s: &[A], m: &[f64], n: &[f64], i: &[f64], offsets: &[usize],
+        os: &mut [A], om: &mut [f64], on: &mut [f64], oi: &mut [f64], onto: bool
+    ) -> () = merge_at_inner;
 }
 
 #[inline(always)]
-fn merge_at_inner<A: Sum>(from: From<A>, offsets: &[usize], out: Into<A>, onto: bool) {
+#[allow(clippy::too_many_arguments)]
+fn merge_at_inner<A: Sum>(
+    s: &[A],
+    m: &[f64],
+    n: &[f64],
+    i: &[f64],
+    offsets: &[usize],
+    os: &mut [A],
+    om: &mut [f64],
+    on: &mut [f64],
+    oi: &mut [f64],
+    onto: bool,
+) {
     let (mut onto, mut rest) = (onto, offsets);
+    macro_rules! arms {
+        ($k:expr, $($n:literal)*) => {
+            match ($k, onto) {
+                $(($n, false) => merge_k::<A, $n, false>(s, m, n, i, rest, os, om, on, oi),
+                  ($n, true) => merge_k::<A, $n, true>(s, m, n, i, rest, os, om, on, oi),)*
+                _ => unreachable!("one to six terms"),
+            }
+        };
+    }
     while !rest.is_empty() {
         let k = rest.len().min(6);
-        let out = (&mut *out.0, &mut *out.1, &mut *out.2, &mut *out.3);
-        match k {
-            1 => merge_k::<A, 1>(from, rest, out, onto),
-            2 => merge_k::<A, 2>(from, rest, out, onto),
-            3 => merge_k::<A, 3>(from, rest, out, onto),
-            4 => merge_k::<A, 4>(from, rest, out, onto),
-            5 => merge_k::<A, 5>(from, rest, out, onto),
-            _ => merge_k::<A, 6>(from, rest, out, onto),
-        }
+        arms!(k, 1 2 3 4 5 6);
         onto = true;
         rest = &rest[k..];
     }
 }
 
 #[inline(always)]
-fn merge_k<A: Sum, const K: usize>(from: From<A>, offsets: &[usize], out: Into<A>, onto: bool) {
-    let len = out.0.len();
-    let (os, om, on, oi) = (out.0, &mut out.1[..len], &mut out.2[..len], &mut out.3[..len]);
-    let at = |k: usize| offsets[k]..offsets[k] + len;
-    let s: [&[A]; K] = std::array::from_fn(|k| &from.0[at(k)]);
-    let m: [&[f64]; K] = std::array::from_fn(|k| &from.1[at(k)]);
-    let n: [&[f64]; K] = std::array::from_fn(|k| &from.2[at(k)]);
-    let inv: [&[f64]; K] = std::array::from_fn(|k| &from.3[at(k)]);
+#[allow(clippy::too_many_arguments)]
+fn merge_k<A: Sum, const K: usize, const ONTO: bool>(
+    s: &[A],
+    m: &[f64],
+    n: &[f64],
+    inv: &[f64],
+    offsets: &[usize],
+    os: &mut [A],
+    om: &mut [f64],
+    on: &mut [f64],
+    oi: &mut [f64],
+) {
+    let len = os.len();
+    let (om, on, oi) = (&mut om[..len], &mut on[..len], &mut oi[..len]);
+    let mut at = [0; K];
+    at.copy_from_slice(&offsets[..K]);
+    for o in at {
+        assert!(o + len <= s.len() && o + len <= m.len() && o + len <= n.len() && o + len <= inv.len());
+    }
     for x in 0..len {
-        let (ps, pm, pn, pi) = if onto { (os[x], om[x], on[x], oi[x]) } else { (A::default(), 0.0, 0.0, 0.0) };
-        let first = if onto { 0 } else { 1 };
-        // A sum starts from its first term (not from 0), as sums alone do.
-        let (mut sum, mut total, mut square) = if onto { (ps, pn, pm) } else { (s[0][x], n[0][x], m[0][x]) };
-        for k in first..K {
-            // SAFETY: every slice has `len` elements.
-            unsafe {
-                sum = sum.plus(*s[k].get_unchecked(x));
-                total += *n[k].get_unchecked(x);
-                square += *m[k].get_unchecked(x);
+        let (mut sum, mut total, mut square) = (A::default(), 0.0, 0.0);
+        if ONTO {
+            (sum, total, square) = (os[x], on[x], om[x]);
+        }
+        for k in 0..K {
+            // SAFETY: `at[k] + len` was compared with every length.
+            let (s, n, m) =
+                unsafe { (*s.get_unchecked(at[k] + x), *n.get_unchecked(at[k] + x), *m.get_unchecked(at[k] + x)) };
+            // A sum starts from its first term, not from 0, as sums alone do.
+            if k == 0 && !ONTO {
+                (sum, total, square) = (s, n, m);
+            } else {
+                (sum, total, square) = (sum.plus(s), total + n, square + m);
             }
         }
-        let i = if total > 0.0 { 1.0 / total } else { 0.0 };
+        let i = 1.0 / total;
+        let i = if total > 0.0 { i } else { 0.0 };
         let mean = sum.mean(total, i);
-        if onto {
-            let d = ps.deviation(pn, mean);
-            square = (d * d).mul_add(pi, square);
+        if ONTO {
+            let d = os[x].deviation(on[x], mean);
+            square = (d * d).mul_add(oi[x], square);
         }
         for k in 0..K {
             // SAFETY: as above.
-            let (s, n, i) = unsafe { (*s[k].get_unchecked(x), *n[k].get_unchecked(x), *inv[k].get_unchecked(x)) };
+            let (s, n, i) =
+                unsafe { (*s.get_unchecked(at[k] + x), *n.get_unchecked(at[k] + x), *inv.get_unchecked(at[k] + x)) };
             let d = s.deviation(n, mean);
             square = (d * d).mul_add(i, square);
         }
