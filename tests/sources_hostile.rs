@@ -120,7 +120,8 @@ fn survive(input: &Input) -> Result<(), String> {
     for component in [0, info.components - 1] {
         let last = info.shape.map(|n| n as i64 - 1);
         let corner = Region::new(last, last.map(|i| i + 1));
-        let region = if info.shape.iter().all(|n| *n <= 64) { whole } else { corner };
+        let cells = info.chunk.map_or(1, |c| whole.cells([0; 3], c).voxels());
+        let region = if info.shape.iter().all(|n| *n <= 64) && cells <= 512 { whole } else { corner };
         if info.chunk.is_some_and(|c| c.iter().product::<usize>() > 1 << 20) {
             continue;
         }
