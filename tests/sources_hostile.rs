@@ -131,6 +131,12 @@ fn survive(input: &Input) -> Result<(), String> {
     Ok(())
 }
 
+/// Writes a file anew: cutting an old one to nothing first makes some file systems wait for the disk.
+fn replace(path: &Path, bytes: &[u8]) {
+    fs::remove_file(path).unwrap();
+    fs::write(path, bytes).unwrap();
+}
+
 /// Damages `name` (a file; others beside it are copied along) `rounds` times and reads it each time.
 fn fuzz(name: &str, header: usize, rounds: usize, select: Select) {
     let folder = tempfile::tempdir().unwrap();
@@ -145,7 +151,7 @@ fn fuzz(name: &str, header: usize, rounds: usize, select: Select) {
     for round in 0..rounds {
         let mut bytes = good.clone();
         random.damage(&mut bytes, header);
-        fs::write(&path, &bytes).unwrap();
+        replace(&path, &bytes);
         let mut input = file_input(&path);
         (input.channel, input.time) = (select, select);
         let result = std::panic::catch_unwind(|| survive(&input));
@@ -234,7 +240,7 @@ fn fuzz_zarr(name: &str, rounds: usize, select: Select) {
         let good = fs::read(path).unwrap();
         let mut bytes = good.clone();
         random.damage(&mut bytes, good.len());
-        fs::write(path, &bytes).unwrap();
+        replace(path, &bytes);
         let mut input = file_input(&root);
         (input.channel, input.time) = (select, select);
         let result = std::panic::catch_unwind(|| survive(&input));
@@ -245,19 +251,19 @@ fn fuzz_zarr(name: &str, rounds: usize, select: Select) {
             Err(_) => panic!("panicked: {}", what()),
         }
         assert!(largest() <= BOUND, "{} bytes asked for: {}", largest(), what());
-        fs::write(path, &good).unwrap();
+        replace(path, &good);
     }
     assert!(read > 0 && refused > rounds / 50, "{name}: {read} read, {refused} refused");
 }
 
 #[test]
 fn damaged_zarr() {
-    fuzz_zarr("zarr/v3sharded", 3000, Select::Index(0));
-    fuzz_zarr("zarr/v3plain", 2000, Select::All);
-    fuzz_zarr("zarr/v2be", 2000, Select::Index(0));
-    fuzz_zarr("zarr/v2f", 2000, Select::Index(0));
-    fuzz_zarr("zarr/ome05", 3000, Select::All);
-    fuzz_zarr("zarr/ome04", 2000, Select::Index(0));
+    fuzz_zarr("zarr/v3sharded", 1000, Select::Index(0));
+    fuzz_zarr("zarr/v3plain", 600, Select::All);
+    fuzz_zarr("zarr/v2be", 600, Select::Index(0));
+    fuzz_zarr("zarr/v2f", 600, Select::Index(0));
+    fuzz_zarr("zarr/ome05", 1000, Select::All);
+    fuzz_zarr("zarr/ome04", 600, Select::Index(0));
 }
 
 /// Every cut of every small file is an error or (past the last voxel) the whole volume.
