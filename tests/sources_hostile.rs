@@ -120,7 +120,8 @@ fn survive(input: &Input) -> Result<(), String> {
     for component in [0, info.components - 1] {
         let last = info.shape.map(|n| n as i64 - 1);
         let corner = Region::new(last, last.map(|i| i + 1));
-        let region = if info.shape.iter().all(|n| *n <= 64) { whole } else { corner };
+        let cells = info.chunk.map_or(1, |c| whole.cells([0; 3], c).voxels());
+        let region = if info.shape.iter().all(|n| *n <= 64) && cells <= 512 { whole } else { corner };
         if info.chunk.is_some_and(|c| c.iter().product::<usize>() > 1 << 20) {
             continue;
         }
@@ -128,6 +129,12 @@ fn survive(input: &Input) -> Result<(), String> {
         source.read(component, region, out.view_mut(region.shape())).map_err(|e| e.to_string())?;
     }
     Ok(())
+}
+
+/// Writes a file anew: cutting an old one to nothing first makes some file systems wait for the disk.
+fn replace(path: &Path, bytes: &[u8]) {
+    fs::remove_file(path).unwrap();
+    fs::write(path, bytes).unwrap();
 }
 
 /// Damages `name` (a file; others beside it are copied along) `rounds` times and reads it each time.
@@ -144,7 +151,7 @@ fn fuzz(name: &str, header: usize, rounds: usize, select: Select) {
     for round in 0..rounds {
         let mut bytes = good.clone();
         random.damage(&mut bytes, header);
-        fs::write(&path, &bytes).unwrap();
+        replace(&path, &bytes);
         let mut input = file_input(&path);
         (input.channel, input.time) = (select, select);
         let result = std::panic::catch_unwind(|| survive(&input));
@@ -233,7 +240,7 @@ fn fuzz_zarr(name: &str, rounds: usize, select: Select) {
         let good = fs::read(path).unwrap();
         let mut bytes = good.clone();
         random.damage(&mut bytes, good.len());
-        fs::write(path, &bytes).unwrap();
+        replace(path, &bytes);
         let mut input = file_input(&root);
         (input.channel, input.time) = (select, select);
         let result = std::panic::catch_unwind(|| survive(&input));
@@ -244,19 +251,19 @@ fn fuzz_zarr(name: &str, rounds: usize, select: Select) {
             Err(_) => panic!("panicked: {}", what()),
         }
         assert!(largest() <= BOUND, "{} bytes asked for: {}", largest(), what());
-        fs::write(path, &good).unwrap();
+        replace(path, &good);
     }
     assert!(read > 0 && refused > rounds / 50, "{name}: {read} read, {refused} refused");
 }
 
 #[test]
 fn damaged_zarr() {
-    fuzz_zarr("zarr/v3sharded", 3000, Select::Index(0));
-    fuzz_zarr("zarr/v3plain", 2000, Select::All);
-    fuzz_zarr("zarr/v2be", 2000, Select::Index(0));
-    fuzz_zarr("zarr/v2f", 2000, Select::Index(0));
-    fuzz_zarr("zarr/ome05", 3000, Select::All);
-    fuzz_zarr("zarr/ome04", 2000, Select::Index(0));
+    fuzz_zarr("zarr/v3sharded", 1000, Select::Index(0));
+    fuzz_zarr("zarr/v3plain", 600, Select::All);
+    fuzz_zarr("zarr/v2be", 600, Select::Index(0));
+    fuzz_zarr("zarr/v2f", 600, Select::Index(0));
+    fuzz_zarr("zarr/ome05", 1000, Select::All);
+    fuzz_zarr("zarr/ome04", 600, Select::Index(0));
 }
 
 /// Every cut of every small file is an error or (past the last voxel) the whole volume.

@@ -132,5 +132,7 @@ pub fn free_bytes(folder: &Path) -> Option<u64> {
         let mut stat: libc::statvfs = std::mem::zeroed();
         (libc::statvfs(path.as_ptr(), &mut stat), stat)
     };
-    (code == 0).then(|| (stat.f_bavail as u64).saturating_mul(stat.f_frsize as u64))
+    #[allow(clippy::unnecessary_cast)] // other systems have other widths here
+    let free = (stat.f_bavail as u64).saturating_mul(stat.f_frsize as u64);
+    (code == 0).then_some(free)
 }

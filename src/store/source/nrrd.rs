@@ -98,7 +98,7 @@ fn take_line(path: &Path, header: &mut Header, line: &str, in_list: &mut bool, n
         "centers" => "centerings",
         other => other,
     };
-    *in_list = name == "data file" && value.trim().split_whitespace().next() == Some("LIST");
+    *in_list = name == "data file" && value.split_whitespace().next() == Some("LIST");
     header.fields.insert(name.to_string(), value.trim().to_string());
     Ok(())
 }
@@ -246,9 +246,7 @@ fn geometry(
             info.spacing[2 - i] = v.iter().take(3).map(|n| n * n).sum::<f64>().sqrt();
             (0..3).for_each(|r| matrix[r][i] = v.get(r).copied().unwrap_or(0.0));
         }
-        for i in space.len()..3 {
-            matrix[i][i] = 1.0; // axes that the file lacks
-        }
+        (space.len()..3).for_each(|i| matrix[i][i] = 1.0); // axes that the file lacks
         (0..3).for_each(|r| matrix[r][3] = origin.get(r).copied().filter(|v| v.is_finite()).unwrap_or(0.0));
         info.orientation = Some(Orientation { matrix, space: if name.is_empty() { "unknown".into() } else { name } });
     } else {

@@ -101,7 +101,7 @@ pub fn over_files(
 ) -> Result<Lattice> {
     let total: u64 = axes.iter().map(|a| a.size()).product::<u64>() * lattice.dtype.size() as u64;
     let mismatch = |text: String| Err(Error::file(path, format!("{count} data files do not fit the sizes: {text}")));
-    if count == 0 || total % count as u64 != 0 {
+    if count == 0 || !total.is_multiple_of(count as u64) {
         return mismatch(format!("{total} bytes of voxels"));
     }
     let each = total / count as u64;
@@ -128,7 +128,7 @@ pub fn over_files(
             if inside + span > each {
                 return mismatch("a plane would be split between files".to_string());
             }
-            table.push((file as u32, inside.checked_add(base).unwrap_or(u64::MAX)));
+            table.push((file as u32, inside.saturating_add(base)));
         }
     }
     Ok(Lattice { planes: Planes::Table(table), ..lattice })

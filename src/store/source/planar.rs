@@ -200,13 +200,16 @@ fn pick(input: &Input, select: Select, count: usize, what: &str) -> Result<Vec<u
 /// More components than this are a mistake in the header.
 const MOST_COMPONENTS: usize = 65536;
 
+/// Time and channel of one component.
+pub type TimeChannel = (usize, usize);
+
 /// The (time, channel) pairs that the input selects, time slowest, and their names (none for a scalar volume).
 pub fn components(
     input: &Input,
     times: usize,
     channels: usize,
     labels: &[String],
-) -> Result<(Vec<(usize, usize)>, Vec<String>)> {
+) -> Result<(Vec<TimeChannel>, Vec<String>)> {
     let (t, c) = (pick(input, input.time, times, "time")?, pick(input, input.channel, channels, "channel")?);
     if t.len().saturating_mul(c.len()) > MOST_COMPONENTS {
         let text =

@@ -43,7 +43,7 @@ impl Reblock {
             let (file, image) = self.pages[plane];
             let path = &paths[file as usize];
             if open.as_ref().is_none_or(|(f, at, _)| *f != file || *at > image) {
-                open = Some((file, 0, reader(path)?));
+                open = Some((file, 0, reader(path, MOST_CHUNK)?));
             }
             let Some((_, at, decoder)) = &mut open else { continue };
             while *at < image {

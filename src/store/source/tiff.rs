@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::BufReader;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use tiff::decoder::{Decoder, Limits};
@@ -18,20 +19,59 @@ use crate::grid::DType;
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 
-/// Pages of a stack beyond this are a broken file.
-const MOST_PAGES: usize = 1 << 22;
+/// Bytes of the shortest directory of a page with voxels (its width, height and strips); more pages than these fit into
+/// the file mean that the chain of pages goes in circles.
+const LEAST_PAGE: u64 = 40;
 /// Longest strip or tile that is decoded, in bytes.
 pub const MOST_CHUNK: usize = 1 << 30;
 
 pub type Reader = Decoder<BufReader<File>>;
 
-/// Opens a TIFF file at its first page.
-pub fn reader(path: &Path) -> Result<Reader> {
-    let file = BufReader::new(bytes::open_file(path)?);
+/// Opens a TIFF file at its first page, believing in tables of tags and in strips or tiles of up to `most` bytes.
+pub fn reader(path: &Path, most: usize) -> Result<Reader> {
+    let file = bytes::open_file(path)?;
+    check_directory(path, &file).map_err(|text| broken(path, 0, text))?;
     let mut limits = Limits::default();
-    limits.decoding_buffer_size = MOST_CHUNK;
-    limits.intermediate_buffer_size = MOST_CHUNK;
-    Ok(Decoder::new(file).map_err(|e| broken(path, 0, e))?.with_limits(limits))
+    limits.decoding_buffer_size = most;
+    limits.intermediate_buffer_size = most;
+    Ok(Decoder::new(BufReader::new(file)).map_err(|e| broken(path, 0, e))?.with_limits(limits))
+}
+
+/// Refuses a first directory whose tags claim more values than the file has bytes: the decoder takes limits only after
+/// it has read (and allocated for) that one.
+fn check_directory(path: &Path, file: &File) -> Result<(), String> {
+    let len = bytes::file_len(path).map_err(|e| e.to_string())?;
+    let read = |at: u64, n: usize| -> Result<[u8; 8], String> {
+        let mut raw = [0; 8];
+        file.read_exact_at(&mut raw[..n], at)
+            .map_err(|_| "the file ends inside its header or first directory".to_string())?;
+        Ok(raw)
+    };
+    let start = read(0, 4)?;
+    let big = start[0] == b'M';
+    let number = |at: u64, n: usize| -> Result<u64, String> {
+        let raw = read(at, n)?;
+        Ok(if big { u64::from_be_bytes(raw) >> (64 - 8 * n) } else { u64::from_le_bytes(raw) })
+    };
+    let wide = number(2, 2)? == 43;
+    let (at, entries, first, step) = if wide {
+        let at = number(8, 8)?;
+        (at, number(at, 8)?, 8, 20)
+    } else {
+        let at = number(4, 4)?;
+        (at, number(at, 2)?, 2, 12)
+    };
+    if entries > len / step {
+        return Err(format!("the directory claims {entries} tags"));
+    }
+    for i in 0..entries {
+        let entry = at.saturating_add(first + i * step);
+        let count = if wide { number(entry + 4, 8)? } else { number(entry + 4, 4)? };
+        if count > len {
+            return Err(format!("tag {} claims {count} values, the file has {len} bytes", number(entry, 2)?));
+        }
+    }
+    Ok(())
 }
 
 pub fn broken(path: &Path, page: usize, e: impl std::fmt::Display) -> Error {
@@ -142,11 +182,14 @@ fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize) -> Result<Op
 
 /// All pages of a file, and the description of its first.
 fn pages(path: &Path, file: u32) -> Result<(Vec<Page>, Described)> {
-    let mut decoder = reader(path)?;
+    let len = bytes::file_len(path)?;
+    // A tag's values take 32 bytes each in memory and at least one in the file.
+    let mut decoder = reader(path, (len as usize).saturating_mul(32).clamp(1 << 16, MOST_CHUNK))?;
     let text = decoder.find_tag(Tag::ImageDescription).ok().flatten().and_then(|v| v.into_string().ok());
     let mut ratio = |tag: Tag| decoder.find_tag(tag).ok().flatten().and_then(per_unit);
     let resolution = [ratio(Tag::YResolution), ratio(Tag::XResolution)];
     let described = describe(path, text.as_deref().unwrap_or(""), resolution)?;
+    let most = len / LEAST_PAGE;
     let mut pages = Vec::new();
     for image in 0.. {
         if image > 0 {
@@ -155,8 +198,8 @@ fn pages(path: &Path, file: u32) -> Result<(Vec<Page>, Described)> {
             }
             decoder.next_image().map_err(|e| broken(path, image, e))?;
         }
-        if image >= MOST_PAGES {
-            return Err(Error::file(path, format!("the TIFF has more than {MOST_PAGES} pages")));
+        if image as u64 > most {
+            return Err(Error::file(path, "the chain of TIFF pages goes in circles"));
         }
         pages.extend(page(path, &mut decoder, file, image)?);
     }

@@ -129,9 +129,9 @@ fn lead_axes(path: &Path, meta: &ArrayMeta, multiscale: Option<&Multiscale>) -> 
         return Err(Error::file(path, text));
     }
     let mut out = Vec::new();
-    for a in 0..lead {
-        out.push(match kinds[a] {
-            _ if meta.shape[a] == 1 && kinds[a].is_none() => Lead::Single,
+    for (a, kind) in kinds[..lead].iter().enumerate() {
+        out.push(match kind {
+            None if meta.shape[a] == 1 => Lead::Single,
             Some("time") => Lead::Time,
             Some("channel") => Lead::Channel,
             // Unnamed: c next to space, t before it.
@@ -155,7 +155,7 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
         let i = 3 - (n - a);
         info.spacing[i] = m.scale.get(a).copied().unwrap_or(1.0);
         info.origin[i] = m.translation.get(a).copied().unwrap_or(0.0);
-        if info.shape[i] == 1 && !(info.spacing[i] > 0.0) {
+        if info.shape[i] == 1 && info.spacing[i].partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
             info.spacing[i] = 1.0;
         }
         let own = m.axes.get(a).and_then(|axis| axis.2.clone());
