@@ -39,7 +39,7 @@ impl Case {
         let [_, ny, nx] = shape;
         let mut blob = |i: usize| {
             let (z, y, x) = (i / (ny * nx), i / nx % ny, i % nx);
-            let mut cell = Random(seed ^ (((z / 4) << 40 | (y / 4) << 20 | x / 8) as u64 + 1));
+            let mut cell = Random(seed ^ ((((z / 4) << 40) | ((y / 4) << 20) | (x / 8)) as u64 + 1));
             cell.next();
             u8::from(!(cell.next() < excluded || random.next() < excluded * 0.2))
         };
