@@ -1,7 +1,7 @@
 use super::*;
 use crate::brick::{Scratch, Voxels};
+use crate::grid::Voxel;
 use crate::grid::{DType, ViewMut};
-use crate::kernel::simd::Level;
 
 const ALL: [bool; 3] = [true; 3];
 
