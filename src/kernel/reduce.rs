@@ -98,18 +98,14 @@ impl Cells {
         assert!(kind != Reduce::Moments || src.mean.is_some(), "moments need the channel of means");
         self.prepare(kind, std, halve.map(|h| 1 + usize::from(h)), extent);
         let Context { level, scratch } = cx;
-        let scratch = scratch.take(padded::<f64>(extent[2]) * (rows::SCRATCH_ROWS + 1));
+        let scratch = scratch.take(padded::<f64>(extent[2]) * (rows::SCRATCH_ROWS + 3));
         let (line, rest) = cut::<f64>(scratch, extent[2]);
+        let (up, rest) = cut::<f64>(rest, extent[2]);
+        let (counts, rest) = cut::<f64>(rest, extent[2]);
         for c in 0..self.shape[0] * self.shape[1] {
             let at = RowOf::new(c, self.shape, extent, halve);
             let mask = mask_of(src.needed, &at);
-            let n = self.shape[2];
-            let out = &mut self.value[c * n..(c + 1) * n];
-            let done = mask != Mask::Mixed
-                && with_view!(AnyView, src.value, v => {
-                    let picked = at.map(|[z, y]| v.row_at(z, y));
-                    rows::direct(*level, kind, &picked[..at.n], halve[2], line, out)
-                });
+            let done = mask != Mask::Mixed && self.first_direct(*level, c, &src, &at, halve[2], [line, up, counts]);
             if !done {
                 let mut children = Children::new(rest, at.n, extent[2]);
                 load_voxels(*level, &mut children, kind, std, &src, &at);
@@ -117,6 +113,41 @@ impl Cells {
             } else if mask == Mask::Excluded {
                 self.marks(c).iter_mut().for_each(|m| *m = -*m);
             }
+        }
+    }
+
+    /// Row `c` the fast way, where no voxel is NaN and the mask is uniform. False if it must be made the general way.
+    fn first_direct(
+        &mut self,
+        level: Level,
+        c: usize,
+        src: &Level0,
+        at: &RowOf,
+        halve_x: bool,
+        [line, up, counts]: [&mut [f64]; 3],
+    ) -> bool {
+        let n = self.shape[2];
+        let row = c * n..(c + 1) * n;
+        if self.kind != Reduce::Moments {
+            return with_view!(AnyView, src.value, v => {
+                let picked = at.map(|[z, y]| v.row_at(z, y));
+                rows::direct(level, self.kind, &picked[..at.n], halve_x, line, &mut self.value[row])
+            });
+        }
+        let counts = &mut counts[..n];
+        self.implied([c / self.shape[1], c % self.shape[1]], counts);
+        let out = [&mut self.value, &mut self.inner, &mut self.between].map(|v| &mut v[row.clone()]);
+        macro_rules! rows_of {
+            ($variance:expr, $mean:expr) => {{
+                let variance = at.map(|[z, y]| $variance.row_at(z, y));
+                let mean = at.map(|[z, y]| $mean.row_at(z, y));
+                rows::moments(level, &variance[..at.n], &mean[..at.n], self.std, halve_x, counts, [line, up], out)
+            }};
+        }
+        match (src.value, src.mean) {
+            (AnyView::F32(v), Some(AnyView::F32(m))) => rows_of!(v, m),
+            (AnyView::F64(v), Some(AnyView::F64(m))) => rows_of!(v, m),
+            _ => false,
         }
     }
 

@@ -162,6 +162,56 @@ crate::multiversion! {
 }
 
 #[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn moments_inner<S: Voxel>(
+    variance: &[&[S]],
+    mean: &[&[S]],
+    std: bool,
+    halve_x: bool,
+    counts: &[f64],
+    [line, up]: [&mut [f64]; 2],
+    [value, inner, between]: [&mut [f64]; 3],
+) -> bool {
+    let add = |a: f64, b: f64| a + b;
+    match std {
+        true => vertical(variance, line, |v| v.to_f64() * v.to_f64(), add),
+        false => vertical(variance, line, S::to_f64, add),
+    }
+    pairs(line, halve_x, inner, add);
+    vertical(mean, line, S::to_f64, add);
+    pairs(line, halve_x, value, add);
+    // The cells' means, for as long as it takes to spread them, where the deviations go.
+    means_inner(value, counts, halve_x, between, up);
+    let n = line.len();
+    let up = &up[..n];
+    let square = |v: S, x: usize| (v.to_f64() - up[x]) * (v.to_f64() - up[x]);
+    match *mean {
+        [a] => (0..n).for_each(|x| line[x] = square(a[x], x)),
+        [a, b] => {
+            let (a, b) = (&a[..n], &b[..n]);
+            (0..n).for_each(|x| line[x] = square(a[x], x) + square(b[x], x));
+        }
+        [a, b, c, d] => {
+            let (a, b, c, d) = (&a[..n], &b[..n], &c[..n], &d[..n]);
+            let four = |x: usize| (square(a[x], x) + square(b[x], x)) + (square(c[x], x) + square(d[x], x));
+            (0..n).for_each(|x| line[x] = four(x));
+        }
+        _ => unreachable!("a cell covers one, two or four rows"),
+    }
+    pairs(line, halve_x, between, add);
+    !inner.iter().zip(between).fold(false, |nan, (i, b)| nan | i.is_nan() | b.is_nan())
+}
+
+crate::multiversion! {
+    /// Moments straight from up to four rows of voxels that all count; false where that gave a NaN. The arrays are rows
+    /// of scratch (voxels), then value, inner and between (cells).
+    pub fn moments[S: Voxel](
+        variance: &[&[S]], mean: &[&[S]], std: bool, halve_x: bool, counts: &[f64],
+        scratch: [&mut [f64]; 2], out: [&mut [f64]; 3],
+    ) -> bool = moments_inner;
+}
+
+#[inline(always)]
 fn widen_inner<T: Voxel>(from: &[T], to: &mut [f64]) {
     to.iter_mut().zip(from).for_each(|(d, s)| *d = s.to_f64());
 }
@@ -262,11 +312,28 @@ crate::multiversion! {
     fn exclude[](up: &[f64], dropped: f64, row: [&mut [f64]; 4]) -> () = exclude_inner;
 }
 
+#[inline(always)]
+fn negative_inner(marks: &[f64]) -> bool {
+    marks.iter().fold(0, |any, m| any | m.to_bits()) >> 63 != 0
+}
+
+crate::multiversion! {
+    fn negative[](marks: &[f64]) -> bool = negative_inner;
+}
+
+#[inline(always)]
+fn sign_inner(signs: &[f64], marks: &mut [f64]) {
+    marks.iter_mut().zip(signs).for_each(|(m, s)| *m = m.copysign(*s));
+}
+
+crate::multiversion! {
+    fn sign[](signs: &[f64], marks: &mut [f64]) -> () = sign_inner;
+}
+
 /// Takes excluded children out of every cell that covers others; the cells' signs stay in `children.signs`.
 fn select(level: Level, kind: Reduce, children: &mut Children, halve_x: bool, cells: usize) {
     let n = children.n;
-    let negative = |row: &[f64]| row.iter().fold(0, |any, m| any | m.to_bits()) >> 63 != 0;
-    if !children.rows[..n].iter().any(|r| negative(r[1])) {
+    if !children.rows[..n].iter().any(|r| negative(level, r[1])) {
         return children.signs[..cells].fill(1.0);
     }
     let [line, up, signs] = [&mut children.line, &mut children.up, &mut children.signs].map(std::mem::take);
@@ -312,7 +379,7 @@ pub fn merge(
         (children.line, children.up) = (line, up);
         general_sum(level, children, 3, halve_x, between);
     }
-    mark.iter_mut().zip(children.signs.iter()).for_each(|(m, s)| *m = m.copysign(*s));
+    sign(level, children.signs, mark);
 }
 
 fn general_sum(level: Level, children: &mut Children, field: usize, halve_x: bool, out: &mut [f64]) {
