@@ -145,7 +145,7 @@ fn zarrs_reads_back_every_type_codec_and_layout() {
             for (k, codec) in codecs.into_iter().enumerate() {
                 // Every layout with some type, every type with some layout: syncing files is what costs time here.
                 let layouts = [Some([16, 16, 32]), None, Some([8; 3]), Some([64; 3])];
-                let some = |j: &usize| (dtype.size() + i + k + j) % 4 == 0 || dtype == DType::U8;
+                let some = |j: &usize| (dtype.size() + i + k + j).is_multiple_of(4) || dtype == DType::U8;
                 for (j, shard) in layouts.into_iter().enumerate().filter(|(j, _)| some(j)) {
                     let path = folder.path().join(format!("{i}-{dtype}-{k}-{j}.zarr"));
                     let spec = SinkSpec { codec, shard, ..spec(path, format, dtype, [17, 9, 35]) };
@@ -470,7 +470,7 @@ fn a_failed_write_names_the_chunk_and_leaves_nothing_half_written() {
         assert_eq!(libc::setrlimit(libc::RLIMIT_FSIZE, &limit), 0);
     }
     let whole = field(&spec, 0, 0);
-    let mut put = |x: i64| {
+    let put = |x: i64| {
         let r = Region::new([0, 0, x], [8, 8, x + 8]);
         let part = cut(&whole, [32, 32, 64], r);
         sink.put(0, 0, r, sink.encode(0, r, part.view(r.shape())).unwrap())

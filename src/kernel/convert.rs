@@ -44,7 +44,7 @@ pub fn convert_row<S: Voxel, D: Output>(level: Level, src: &[S], mapping: Mappin
     if D::DTYPE.is_float() || (S::DTYPE == D::DTYPE && mapping.range.is_none()) {
         cast(level, src, dst)
     } else {
-        quantise(level, src, Linear::new(mapping, D::DTYPE), D::from_f64(mapping.fill), dst)
+        quantise(level, src, Linear::new(mapping, D::DTYPE), dst)
     }
 }
 
@@ -57,27 +57,30 @@ struct Linear {
     scale: f64,
     low: f64,
     high: f64,
+    /// What NaN becomes, inside the type's range.
+    fill: f64,
 }
 
 impl Linear {
     fn new(mapping: Mapping, dtype: DType) -> Linear {
         let (least, high) = dtype.range();
+        let fill = if mapping.fill.is_nan() { 0.0 } else { mapping.fill.clamp(least, high) };
         match mapping.range {
-            None => Linear { half: 1.0, lo: 0.0, scale: 1.0, low: least, high },
+            None => Linear { half: 1.0, lo: 0.0, scale: 1.0, low: least, high, fill },
             Some([lo, hi]) => {
                 let half = if (hi - lo).is_finite() { 1.0 } else { 0.5 };
-                Linear { half, lo: lo * half, scale: high / (hi * half - lo * half), low: 0.0, high }
+                Linear { half, lo: lo * half, scale: high / (hi * half - lo * half), low: 0.0, high, fill }
             }
         }
     }
 }
 
-/// A type that can be stored; integers are cut out of the low bits of a rounded f64.
+/// A type that can be stored.
 pub trait Output: Voxel {
-    /// The low bits as this type (integers; floats reinterpret nothing and are never asked).
+    /// The low bits as this type (integers; two's complement).
     fn from_low_bits(bits: u64) -> Self;
     /// The value rounded to this type (floats).
-    fn cast_from(v: f64) -> Self;
+    fn from_value(v: f64) -> Self;
 }
 
 macro_rules! output {
@@ -86,38 +89,50 @@ macro_rules! output {
             #[inline(always)]
             fn from_low_bits(bits: u64) -> Self { bits as $t }
             #[inline(always)]
-            fn cast_from(v: f64) -> Self { v as $t }
+            fn from_value(v: f64) -> Self { v as $t }
         }
     )*};
 }
 output!(u8 i8 u16 i16 u32 i32 f32 f64);
 
-/// 1.5 * 2^52: adding it rounds a number below 2^51 to an integer, ties to even, and leaves it in the low bits.
+/// 1.5 * 2^52: adding it rounds a number below 2^51 to an integer, ties to even, and leaves it in the low bits. Cutting
+/// it out of there takes 0.20 ns per voxel from f32 to u8, against 0.27 by a conversion to i32 (AVX-512, 2-core Zen 4 VM,
+/// 2026-11-23; memcpy of the f32: 0.08 in the cache, 0.33 in memory).
 const ROUNDER: f64 = 6755399441055744.0;
 
 #[inline(always)]
-fn quantise_inner<S: Voxel, D: Output>(src: &[S], map: Linear, fill: D, dst: &mut [D]) {
-    let Linear { half, lo, scale, low, high } = map;
+fn quantise_inner<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
+    // The usual case, [0, 1] or no range, without the parts that do nothing to it.
+    if map.half == 1.0 && map.lo == 0.0 {
+        quantise_loop(src, Linear { half: 1.0, lo: 0.0, ..map }, dst)
+    } else {
+        quantise_loop(src, map, dst)
+    }
+}
+
+#[inline(always)]
+fn quantise_loop<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
+    let Linear { half, lo, scale, low, high, fill } = map;
     for (d, s) in dst.iter_mut().zip(src) {
         let v = s.to_f64();
         let t = (v * half - lo) * scale;
         // Written as compares, not `clamp`, so that they become one instruction each; NaN becomes `low`.
         let t = if t > low { t } else { low };
         let t = if t < high { t } else { high };
-        let code = D::from_low_bits((t + ROUNDER).to_bits());
-        *d = if v.is_nan() { fill } else { code };
+        let t = if v.is_nan() { fill } else { t };
+        *d = D::from_low_bits((t + ROUNDER).to_bits());
     }
 }
 
 #[inline(always)]
 fn cast_inner<S: Voxel, D: Output>(src: &[S], dst: &mut [D]) {
     for (d, s) in dst.iter_mut().zip(src) {
-        *d = D::cast_from(s.to_f64());
+        *d = D::from_value(s.to_f64());
     }
 }
 
 crate::multiversion! {
-    fn quantise[S: Voxel, D: Output](src: &[S], map: Linear, fill: D, dst: &mut [D]) -> () = quantise_inner;
+    fn quantise[S: Voxel, D: Output](src: &[S], map: Linear, dst: &mut [D]) -> () = quantise_inner;
 }
 crate::multiversion! {
     fn cast[S: Voxel, D: Output](src: &[S], dst: &mut [D]) -> () = cast_inner;
@@ -235,5 +250,31 @@ mod tests {
         );
         let inside = |i: usize| i % 30 < 10 && i % 5 < 3;
         assert!((0..60).all(|i| dst[i] == if inside(i) { i as u8 } else { 200 }));
+    }
+
+    /// `cargo test --release --lib convert::tests::speed -- --ignored --nocapture`
+    #[test]
+    #[ignore = "prints timings"]
+    fn speed() {
+        fn best(mut f: impl FnMut()) -> f64 {
+            (0..40).map(|_| std::time::Instant::now()).fold(f64::INFINITY, |least, _| {
+                let start = std::time::Instant::now();
+                f();
+                least.min(start.elapsed().as_secs_f64())
+            })
+        }
+        let n = 1 << 20;
+        let shape = [1, 1 << 10, 1 << 10];
+        let src: Vec<f32> = (0..n).map(|i| i as f32 / n as f32).collect();
+        let (mut bytes, mut words, mut copy) = (vec![0u8; n], vec![0u16; n], vec![0f32; n]);
+        let unit = Mapping { range: Some([0.0, 1.0]), fill: 0.0 };
+        let ns = |t: f64| t * 1e9 / n as f64;
+        println!("memcpy f32: {:.3} ns/voxel", ns(best(|| std::hint::black_box(&mut copy).copy_from_slice(&src))));
+        for level in Level::available() {
+            let from = || AnyView::F32(View::dense(std::hint::black_box(&src), shape));
+            let t8 = best(|| convert_at(level, from(), unit, AnyViewMut::U8(ViewMut::dense(&mut bytes, shape))));
+            let t16 = best(|| convert_at(level, from(), unit, AnyViewMut::U16(ViewMut::dense(&mut words, shape))));
+            println!("{level:?} f32 to u8: {:.3}, to u16: {:.3} ns/voxel", ns(t8), ns(t16));
+        }
     }
 }

@@ -11,8 +11,9 @@ mod tests;
 
 use super::Context;
 use super::convert::{Mapping, convert_row};
+use super::simd::Level;
 use crate::brick::scratch::{cut, padded};
-use crate::grid::{AnyView, AnyViewMut, Shape, View, Voxel};
+use crate::grid::{AnyView, AnyViewMut, Shape, View};
 use crate::stage::Reduce;
 use crate::with_view;
 use rows::Children;
@@ -97,25 +98,56 @@ impl Cells {
         assert!(kind != Reduce::Moments || src.mean.is_some(), "moments need the channel of means");
         self.prepare(kind, std, halve.map(|h| 1 + usize::from(h)), extent);
         let Context { level, scratch } = cx;
-        let scratch = scratch.take(padded::<f64>(extent[2]) * (rows::SCRATCH_ROWS + 1));
+        let scratch = scratch.take(padded::<f64>(extent[2]) * (rows::SCRATCH_ROWS + 3));
         let (line, rest) = cut::<f64>(scratch, extent[2]);
+        let (up, rest) = cut::<f64>(rest, extent[2]);
+        let (counts, rest) = cut::<f64>(rest, extent[2]);
         for c in 0..self.shape[0] * self.shape[1] {
             let at = RowOf::new(c, self.shape, extent, halve);
             let mask = mask_of(src.needed, &at);
-            let n = self.shape[2];
-            let out = &mut self.value[c * n..(c + 1) * n];
-            let done = mask != Mask::Mixed
-                && with_view!(AnyView, src.value, v => {
-                    let picked = at.map(|[z, y]| v.row_at(z, y));
-                    rows::direct(*level, kind, &picked[..at.n], halve[2], line, out)
-                });
+            let done = mask != Mask::Mixed && self.first_direct(*level, c, &src, &at, halve[2], [line, up, counts]);
             if !done {
                 let mut children = Children::new(rest, at.n, extent[2]);
-                load_voxels(&mut children, kind, std, &src, &at);
-                self.merge(*level, c, &mut children, halve[2]);
+                load_voxels(*level, &mut children, kind, std, &src, &at);
+                self.merge(*level, c, &mut children, halve[2], true);
             } else if mask == Mask::Excluded {
                 self.marks(c).iter_mut().for_each(|m| *m = -*m);
             }
+        }
+    }
+
+    /// Row `c` the fast way, where no voxel is NaN and the mask is uniform. False if it must be made the general way.
+    fn first_direct(
+        &mut self,
+        level: Level,
+        c: usize,
+        src: &Level0,
+        at: &RowOf,
+        halve_x: bool,
+        [line, up, counts]: [&mut [f64]; 3],
+    ) -> bool {
+        let n = self.shape[2];
+        let row = c * n..(c + 1) * n;
+        if self.kind != Reduce::Moments {
+            return with_view!(AnyView, src.value, v => {
+                let picked = at.map(|[z, y]| v.row_at(z, y));
+                rows::direct(level, self.kind, &picked[..at.n], halve_x, line, &mut self.value[row])
+            });
+        }
+        let counts = &mut counts[..n];
+        self.implied([c / self.shape[1], c % self.shape[1]], counts);
+        let out = [&mut self.value, &mut self.inner, &mut self.between].map(|v| &mut v[row.clone()]);
+        macro_rules! rows_of {
+            ($variance:expr, $mean:expr) => {{
+                let variance = at.map(|[z, y]| $variance.row_at(z, y));
+                let mean = at.map(|[z, y]| $mean.row_at(z, y));
+                rows::moments(level, &variance[..at.n], &mean[..at.n], self.std, halve_x, counts, [line, up], out)
+            }};
+        }
+        match (src.value, src.mean) {
+            (AnyView::F32(v), Some(AnyView::F32(m))) => rows_of!(v, m),
+            (AnyView::F64(v), Some(AnyView::F64(m))) => rows_of!(v, m),
+            _ => false,
         }
     }
 
@@ -152,12 +184,12 @@ impl Cells {
                     between.copy_from_slice(&fine.between[s..s + width]);
                 }
             }
-            self.merge(*level, c, &mut children, halve[2]);
+            self.merge(*level, c, &mut children, halve[2], false);
         }
     }
 
     /// The general way: row `c` of cells from any children.
-    fn merge(&mut self, level: super::simd::Level, c: usize, children: &mut Children, halve_x: bool) {
+    fn merge(&mut self, level: Level, c: usize, children: &mut Children, halve_x: bool, single: bool) {
         let n = self.shape[2];
         self.marks(c);
         let row = c * n..(c + 1) * n;
@@ -167,6 +199,7 @@ impl Cells {
             self.kind,
             children,
             halve_x,
+            single,
             &mut self.value[row.clone()],
             &mut self.mark[row],
             &mut self.inner[moments.clone()],
@@ -365,26 +398,23 @@ fn mask_of(needed: Option<View<u8>>, at: &RowOf) -> Mask {
 }
 
 /// Voxels as children: one voxel each, no deviation of its own mean.
-fn load_voxels(children: &mut Children, kind: Reduce, std: bool, src: &Level0, at: &RowOf) {
-    fn widen<T: Voxel>(from: &[T], to: &mut [f64]) {
-        to.iter_mut().zip(from).for_each(|(d, s)| *d = s.to_f64());
-    }
+fn load_voxels(level: Level, children: &mut Children, kind: Reduce, std: bool, src: &Level0, at: &RowOf) {
     for (r, &[z, y]) in at.ids[..at.n].iter().enumerate() {
         let [value, mark, inner, between] = children.row(r);
-        with_view!(AnyView, src.value, v => widen(v.row_at(z, y), value));
-        mark.fill(1.0);
         if let (Reduce::Moments, Some(mean)) = (kind, src.mean) {
-            inner.copy_from_slice(value);
+            with_view!(AnyView, src.value, v => rows::widen(level, v.row_at(z, y), inner));
+            with_view!(AnyView, mean, v => rows::widen(level, v.row_at(z, y), value));
             between.fill(0.0);
-            with_view!(AnyView, mean, v => widen(v.row_at(z, y), value));
             if std {
                 inner.iter_mut().for_each(|v| *v *= *v);
             }
+        } else {
+            with_view!(AnyView, src.value, v => rows::widen(level, v.row_at(z, y), value));
         }
-        if let Some(needed) = src.needed {
-            let row = needed.row_at(z, y);
-            mark.iter_mut().zip(row).for_each(|(m, needed)| *m = if *needed != 0 { 1.0 } else { -1.0 });
+        match src.needed {
+            Some(needed) => rows::marks(level, needed.row_at(z, y), mark),
+            None => mark.fill(1.0),
         }
-        rows::drop_invalid(kind, value, mark, inner);
+        rows::drop_invalid(level, kind, value, mark, inner);
     }
 }

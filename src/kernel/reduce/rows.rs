@@ -6,14 +6,16 @@ use crate::kernel::simd::Level;
 use crate::stage::Reduce;
 
 /// Rows of f64 that [`Children`] and [`merge`] take from the scratch.
-pub const SCRATCH_ROWS: usize = 4 * 4 + 2;
+pub const SCRATCH_ROWS: usize = 4 * 4 + 3;
 
 /// The up to four rows that a row of cells is merged from, with room to change them.
 pub struct Children<'a> {
     pub n: usize,
     rows: [[&'a mut [f64]; 4]; 4],
+    /// Working rows: joined rows, a value per cell spread over its voxels, signs of the cells.
     line: &'a mut [f64],
     up: &'a mut [f64],
+    signs: &'a mut [f64],
 }
 
 impl<'a> Children<'a> {
@@ -25,7 +27,7 @@ impl<'a> Children<'a> {
             row
         };
         let rows = std::array::from_fn(|_| std::array::from_fn(|_| next()));
-        Children { n, rows, line: next(), up: next() }
+        Children { n, rows, line: next(), up: next(), signs: next() }
     }
 
     /// Value, mark, inner and between of row `r`.
@@ -159,78 +161,203 @@ crate::multiversion! {
     fn extreme[S: Voxel](max: bool, rows: &[&[S]], halve_x: bool, out: &mut [f64]) -> bool = extreme_inner;
 }
 
-/// Takes voxels that do not count out of the sums: value, variance and count become 0 (the sign of the mark stays). For
-/// the other kinds the NaN itself says so.
-pub fn drop_invalid(kind: Reduce, value: &mut [f64], mark: &mut [f64], inner: &mut [f64]) {
-    let out = |v: &mut f64, m: &mut f64| {
-        *v = 0.0;
-        *m *= 0.0;
-    };
-    match kind {
-        Reduce::Mean => {
-            value.iter_mut().zip(mark).filter(|(v, _)| v.is_nan()).for_each(|(v, m)| out(v, m));
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn moments_inner<S: Voxel>(
+    variance: &[&[S]],
+    mean: &[&[S]],
+    std: bool,
+    halve_x: bool,
+    counts: &[f64],
+    [line, up]: [&mut [f64]; 2],
+    [value, inner, between]: [&mut [f64]; 3],
+) -> bool {
+    let add = |a: f64, b: f64| a + b;
+    match std {
+        true => vertical(variance, line, |v| v.to_f64() * v.to_f64(), add),
+        false => vertical(variance, line, S::to_f64, add),
+    }
+    pairs(line, halve_x, inner, add);
+    vertical(mean, line, S::to_f64, add);
+    pairs(line, halve_x, value, add);
+    // The cells' means, for as long as it takes to spread them, where the deviations go.
+    means_inner(value, counts, halve_x, between, up);
+    let n = line.len();
+    let up = &up[..n];
+    let square = |v: S, x: usize| (v.to_f64() - up[x]) * (v.to_f64() - up[x]);
+    match *mean {
+        [a] => (0..n).for_each(|x| line[x] = square(a[x], x)),
+        [a, b] => {
+            let (a, b) = (&a[..n], &b[..n]);
+            (0..n).for_each(|x| line[x] = square(a[x], x) + square(b[x], x));
         }
-        Reduce::Moments => {
-            for ((v, m), i) in value.iter_mut().zip(mark).zip(inner) {
-                if v.is_nan() | i.is_nan() {
-                    out(v, m);
-                    *i = 0.0;
-                }
+        [a, b, c, d] => {
+            let (a, b, c, d) = (&a[..n], &b[..n], &c[..n], &d[..n]);
+            let four = |x: usize| (square(a[x], x) + square(b[x], x)) + (square(c[x], x) + square(d[x], x));
+            (0..n).for_each(|x| line[x] = four(x));
+        }
+        _ => unreachable!("a cell covers one, two or four rows"),
+    }
+    pairs(line, halve_x, between, add);
+    !inner.iter().zip(between).fold(false, |nan, (i, b)| nan | i.is_nan() | b.is_nan())
+}
+
+crate::multiversion! {
+    /// Moments straight from up to four rows of voxels that all count; false where that gave a NaN. The arrays are rows
+    /// of scratch (voxels), then value, inner and between (cells).
+    pub fn moments[S: Voxel](
+        variance: &[&[S]], mean: &[&[S]], std: bool, halve_x: bool, counts: &[f64],
+        scratch: [&mut [f64]; 2], out: [&mut [f64]; 3],
+    ) -> bool = moments_inner;
+}
+
+#[inline(always)]
+fn widen_inner<T: Voxel>(from: &[T], to: &mut [f64]) {
+    to.iter_mut().zip(from).for_each(|(d, s)| *d = s.to_f64());
+}
+
+crate::multiversion! {
+    /// Voxels as f64.
+    pub fn widen[T: Voxel](from: &[T], to: &mut [f64]) -> () = widen_inner;
+}
+
+#[inline(always)]
+fn marks_inner(needed: &[u8], mark: &mut [f64]) {
+    mark.iter_mut().zip(needed).for_each(|(m, n)| *m = if *n != 0 { 1.0 } else { -1.0 });
+}
+
+crate::multiversion! {
+    /// One voxel each, negative where `needed` is 0.
+    pub fn marks[](needed: &[u8], mark: &mut [f64]) -> () = marks_inner;
+}
+
+#[inline(always)]
+fn drop_inner(value: &mut [f64], mark: &mut [f64], inner: Option<&mut [f64]>) {
+    let n = value.len();
+    let (value, mark) = (&mut value[..n], &mut mark[..n]);
+    match inner {
+        None => {
+            for (v, m) in value.iter_mut().zip(mark) {
+                let bad = v.is_nan();
+                *v = if bad { 0.0 } else { *v };
+                *m = if bad { *m * 0.0 } else { *m };
             }
         }
+        Some(inner) => {
+            for ((v, m), i) in value.iter_mut().zip(mark).zip(&mut inner[..n]) {
+                let bad = v.is_nan() | i.is_nan();
+                *v = if bad { 0.0 } else { *v };
+                *i = if bad { 0.0 } else { *i };
+                *m = if bad { *m * 0.0 } else { *m };
+            }
+        }
+    }
+}
+
+crate::multiversion! {
+    /// Takes voxels that do not count out of the sums: value, variance and count become 0 (the sign of the mark stays).
+    fn drop_nan[](value: &mut [f64], mark: &mut [f64], inner: Option<&mut [f64]>) -> () = drop_inner;
+}
+
+/// Makes voxels that are NaN not count. For kinds other than Mean and Moments the NaN itself says so.
+pub fn drop_invalid(level: Level, kind: Reduce, value: &mut [f64], mark: &mut [f64], inner: &mut [f64]) {
+    match kind {
+        Reduce::Mean => drop_nan(level, value, mark, None),
+        Reduce::Moments => drop_nan(level, value, mark, Some(inner)),
         Reduce::Min | Reduce::Max | Reduce::Stride => {}
     }
 }
 
-/// Takes excluded children out of every cell that covers others, and flags (-1 in `sign`, else 1) those that do not.
-fn select(kind: Reduce, children: &mut Children, halve_x: bool, sign: &mut [f64]) {
-    let width = children.line.len();
-    let signs = children.rows[..children.n].iter().flat_map(|r| r[1].iter());
-    let (any, all) =
-        signs.fold((false, true), |(any, all), m| (any | m.is_sign_negative(), all & m.is_sign_negative()));
-    if !any || all {
-        return sign.fill(if all { -1.0 } else { 1.0 });
+/// A value per cell to each of its voxels.
+#[inline(always)]
+fn spread(cells: &[f64], halve_x: bool, up: &mut [f64]) {
+    if !halve_x {
+        return up.copy_from_slice(cells);
     }
-    let dropped = if matches!(kind, Reduce::Mean | Reduce::Moments) { 0.0 } else { f64::NAN };
-    for (c, sign) in sign.iter_mut().enumerate() {
-        let lo = c << usize::from(halve_x);
-        let span = lo..(lo + 1 + usize::from(halve_x)).min(width);
-        let rows = &mut children.rows[..children.n];
-        let needed = |m: &f64| m.is_sign_positive();
-        let any = rows.iter().any(|r| r[1][span.clone()].iter().any(needed));
-        *sign = if any { 1.0 } else { -1.0 };
-        for row in rows.iter_mut().filter(|_| any) {
-            for x in span.clone() {
-                if row[1][x].is_sign_positive() {
-                    continue;
-                }
-                row[0][x] = dropped;
-                row[1][x] = 0.0;
-                row[2][x] = 0.0;
-                row[3][x] = 0.0;
-            }
-        }
+    let (two, one) = up.as_chunks_mut::<2>();
+    two.iter_mut().zip(cells).for_each(|(u, c)| *u = [*c; 2]);
+    if let Some(u) = one.first_mut() {
+        *u = cells[cells.len() - 1];
     }
 }
 
-/// Makes a row of cells from any children, with NaN, masks and moments.
+/// 1 for every cell that covers a voxel that is needed, else -1; per voxel in `up`.
+#[inline(always)]
+fn signs_inner(marks: &[&[f64]], halve_x: bool, line: &mut [f64], signs: &mut [f64], up: &mut [f64]) {
+    let greater = |a: f64, b: f64| if b > a { b } else { a };
+    vertical(marks, line, |m| 1f64.copysign(m), greater);
+    pairs(line, halve_x, signs, greater);
+    spread(signs, halve_x, up);
+}
+
+crate::multiversion! {
+    fn signs_of[](marks: &[&[f64]], halve_x: bool, line: &mut [f64], signs: &mut [f64], up: &mut [f64]) -> () = signs_inner;
+}
+
+/// Voxels that are excluded from a cell that has others leave it; marks become counts.
+#[inline(always)]
+fn exclude_inner(up: &[f64], dropped: f64, [value, mark, inner, between]: [&mut [f64]; 4]) {
+    let n = up.len();
+    let (value, mark, inner, between) = (&mut value[..n], &mut mark[..n], &mut inner[..n], &mut between[..n]);
+    for x in 0..n {
+        let out = (up[x] > 0.0) & mark[x].is_sign_negative();
+        value[x] = if out { dropped } else { value[x] };
+        mark[x] = if out { 0.0 } else { mark[x].abs() };
+        inner[x] = if out { 0.0 } else { inner[x] };
+        between[x] = if out { 0.0 } else { between[x] };
+    }
+}
+
+crate::multiversion! {
+    fn exclude[](up: &[f64], dropped: f64, row: [&mut [f64]; 4]) -> () = exclude_inner;
+}
+
+#[inline(always)]
+fn negative_inner(marks: &[f64]) -> bool {
+    marks.iter().fold(0, |any, m| any | m.to_bits()) >> 63 != 0
+}
+
+crate::multiversion! {
+    fn negative[](marks: &[f64]) -> bool = negative_inner;
+}
+
+#[inline(always)]
+fn sign_inner(signs: &[f64], marks: &mut [f64]) {
+    marks.iter_mut().zip(signs).for_each(|(m, s)| *m = m.copysign(*s));
+}
+
+crate::multiversion! {
+    fn sign[](signs: &[f64], marks: &mut [f64]) -> () = sign_inner;
+}
+
+/// Takes excluded children out of every cell that covers others; the cells' signs stay in `children.signs`.
+fn select(level: Level, kind: Reduce, children: &mut Children, halve_x: bool, cells: usize) {
+    let n = children.n;
+    if !children.rows[..n].iter().any(|r| negative(level, r[1])) {
+        return children.signs[..cells].fill(1.0);
+    }
+    let [line, up, signs] = [&mut children.line, &mut children.up, &mut children.signs].map(std::mem::take);
+    signs_of(level, &children.field(1)[..n], halve_x, line, &mut signs[..cells], up);
+    let dropped = if matches!(kind, Reduce::Mean | Reduce::Moments) { 0.0 } else { f64::NAN };
+    (0..n).for_each(|r| exclude(level, up, dropped, children.row(r)));
+    (children.line, children.up, children.signs) = (line, up, signs);
+}
+
+/// Makes a row of cells from any children, with NaN, masks and moments. `single`: the children are voxels.
 #[allow(clippy::too_many_arguments)]
 pub fn merge(
     level: Level,
     kind: Reduce,
     children: &mut Children,
     halve_x: bool,
+    single: bool,
     value: &mut [f64],
     mark: &mut [f64],
     inner: &mut [f64],
     between: &mut [f64],
 ) {
-    // `mark` holds the signs until the counts are known.
-    select(kind, children, halve_x, mark);
+    select(level, kind, children, halve_x, mark.len());
     let n = children.n;
-    for row in &mut children.rows[..n] {
-        row[1].iter_mut().for_each(|m| *m = m.abs());
-    }
     match kind {
         Reduce::Mean => general_sum(level, children, 0, halve_x, value),
         Reduce::Min => drop(extreme(level, false, &children.field(0)[..n], halve_x, value)),
@@ -241,15 +368,18 @@ pub fn merge(
             general_sum(level, children, 2, halve_x, inner);
         }
     }
-    // The signs wait in `up` (cells are never more than their children).
-    let mut signs = std::mem::take(&mut children.up);
-    signs[..mark.len()].copy_from_slice(mark);
     general_sum(level, children, 1, halve_x, mark);
     if kind == Reduce::Moments {
-        deviations(level, children, halve_x, value, mark, between);
+        let [line, up] = [&mut children.line, &mut children.up].map(std::mem::take);
+        means(level, value, mark, halve_x, &mut line[..mark.len()], up);
+        for r in 0..n {
+            let [value, mark, _, between] = children.row(r);
+            deviations(level, single, value, mark, up, between);
+        }
+        (children.line, children.up) = (line, up);
+        general_sum(level, children, 3, halve_x, between);
     }
-    mark.iter_mut().zip(signs.iter()).for_each(|(m, s)| *m = m.copysign(*s));
-    children.up = std::mem::take(&mut signs);
+    sign(level, children.signs, mark);
 }
 
 fn general_sum(level: Level, children: &mut Children, field: usize, halve_x: bool, out: &mut [f64]) {
@@ -269,42 +399,43 @@ fn first_valid(children: &Children, halve_x: bool, out: &mut [f64]) {
     }
 }
 
-/// Sum over the children of their own deviations plus n (mean - the cell's mean)^2: positive terms only.
-fn deviations(level: Level, children: &mut Children, halve_x: bool, sums: &[f64], counts: &[f64], out: &mut [f64]) {
-    for r in 0..children.n {
-        let [value, mark, _, between] = children.row(r);
-        spread(level, value, mark, halve_x, sums, counts, between);
-    }
-    general_sum(level, children, 3, halve_x, out);
-}
-
 #[inline(always)]
 fn mean_of(sum: f64, count: f64) -> f64 {
-    if count > 0.0 { sum / count } else { 0.0 }
+    // A division by 1 where nothing counts, so that no branch is needed.
+    sum / if count > 0.0 { count } else { 1.0 }
 }
 
 #[inline(always)]
-fn spread_inner(value: &[f64], mark: &[f64], halve_x: bool, sums: &[f64], counts: &[f64], between: &mut [f64]) {
-    let term = |v: f64, m: f64, mean: f64| {
-        let d = mean_of(v, m) - mean;
-        m * (d * d)
-    };
-    if !halve_x {
-        for x in 0..between.len() {
-            between[x] += term(value[x], mark[x], mean_of(sums[x], counts[x]));
+fn means_inner(sums: &[f64], counts: &[f64], halve_x: bool, means: &mut [f64], up: &mut [f64]) {
+    means.iter_mut().zip(sums).zip(counts).for_each(|((d, s), n)| *d = mean_of(*s, *n));
+    spread(means, halve_x, up);
+}
+
+crate::multiversion! {
+    /// The cells' means, per voxel in `up`.
+    fn means[](sums: &[f64], counts: &[f64], halve_x: bool, means: &mut [f64], up: &mut [f64]) -> () = means_inner;
+}
+
+#[inline(always)]
+fn deviations_inner(single: bool, value: &[f64], mark: &[f64], up: &[f64], between: &mut [f64]) {
+    let n = between.len();
+    let (value, mark, up) = (&value[..n], &mark[..n], &up[..n]);
+    if single {
+        for x in 0..n {
+            let d = value[x] - up[x];
+            between[x] += mark[x] * (d * d);
         }
-        return;
-    }
-    for (c, two) in between.chunks_mut(2).enumerate() {
-        let mean = mean_of(sums[c], counts[c]);
-        for (i, b) in two.iter_mut().enumerate() {
-            *b += term(value[2 * c + i], mark[2 * c + i], mean);
+    } else {
+        for x in 0..n {
+            let d = mean_of(value[x], mark[x]) - up[x];
+            between[x] += mark[x] * (d * d);
         }
     }
 }
 
 crate::multiversion! {
-    fn spread[](value: &[f64], mark: &[f64], halve_x: bool, sums: &[f64], counts: &[f64], between: &mut [f64]) -> () = spread_inner;
+    /// Adds n (mean - the cell's mean)^2 to the children's own deviations: positive terms only, nothing cancels.
+    fn deviations[](single: bool, value: &[f64], mark: &[f64], up: &[f64], between: &mut [f64]) -> () = deviations_inner;
 }
 
 /// The cells' values: means, variances or their roots, extremes; NaN where no voxel counted.

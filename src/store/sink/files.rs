@@ -1,8 +1,10 @@
 //! Files that appear whole or not at all: unique temporaries, rename, sync.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::{Error, Result};
@@ -20,25 +22,61 @@ pub fn cannot_write(path: &Path, error: io::Error) -> Error {
     }
 }
 
-/// Makes entries of a folder (new names, renames) durable.
-pub fn sync_dir(dir: &Path) -> Result<()> {
-    let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-    File::open(dir).and_then(|d| d.sync_all()).map_err(|e| cannot_write(dir, e))
+/// Beyond so many single syncs, one of the whole file system is cheaper (0.3 ms a file and 0.1 ms a folder against
+/// 1.8 ms, ext4, 2-core Zen 4 VM, 2026-11-23; many times that on a busy disk, where each waits for the journal).
+const SINGLE_SYNCS: usize = 6;
+
+/// Makes entries of folders (new names, renames) durable.
+pub fn sync_dirs(dirs: &BTreeSet<PathBuf>) -> Result<()> {
+    let or_here = |dir: &PathBuf| if dir.as_os_str().is_empty() { PathBuf::from(".") } else { dir.clone() };
+    let sync = |dir: PathBuf| File::open(&dir).and_then(|d| d.sync_all()).map_err(|e| cannot_write(&dir, e));
+    match dirs.first() {
+        Some(first) if dirs.len() > SINGLE_SYNCS => sync_everything(&or_here(first)),
+        _ => dirs.iter().map(or_here).try_for_each(sync),
+    }
 }
 
-/// Makes a folder and those above it, durably.
-pub fn ensure_dir(dir: &Path) -> Result<()> {
+/// Makes files durable; `path_of(i)` is the name for errors.
+pub fn sync_files(files: &[Arc<File>], path_of: impl Fn(usize) -> PathBuf) -> Result<()> {
+    if files.len() > SINGLE_SYNCS {
+        return sync_everything(&path_of(0));
+    }
+    files.iter().enumerate().try_for_each(|(i, f)| f.sync_data().map_err(|e| cannot_write(&path_of(i), e)))
+}
+
+/// Makes all that was written to the file system of `path` (or of the nearest folder above that exists) durable.
+fn sync_everything(path: &Path) -> Result<()> {
+    let dir = path.ancestors().find(|p| p.is_dir()).unwrap_or(Path::new("."));
+    let file = File::open(dir).map_err(|e| cannot_write(dir, e))?;
+    #[cfg(target_os = "linux")]
+    // SAFETY: the descriptor is open.
+    if unsafe { libc::syncfs(std::os::fd::AsRawFd::as_raw_fd(&file)) } != 0 {
+        return Err(cannot_write(path, io::Error::last_os_error()));
+    }
+    #[cfg(not(target_os = "linux"))]
+    // SAFETY: takes nothing and cannot fail.
+    unsafe {
+        libc::sync()
+    };
+    drop(file);
+    Ok(())
+}
+
+/// Makes a folder and those above it; adds the folders that got new entries to `changed`.
+pub fn ensure_dir(dir: &Path, changed: &mut BTreeSet<PathBuf>) -> Result<()> {
     if dir.as_os_str().is_empty() || dir.is_dir() {
         return Ok(());
     }
     let parent = dir.parent().unwrap_or(Path::new(""));
-    ensure_dir(parent)?;
+    ensure_dir(parent, changed)?;
     match fs::create_dir(dir) {
-        Ok(()) => sync_dir(parent),
+        Ok(()) => {}
         // Another thread was faster.
-        Err(e) if e.kind() == io::ErrorKind::AlreadyExists && dir.is_dir() => Ok(()),
-        Err(e) => Err(cannot_write(dir, e)),
+        Err(e) if e.kind() == io::ErrorKind::AlreadyExists && dir.is_dir() => {}
+        Err(e) => return Err(cannot_write(dir, e)),
     }
+    changed.insert(parent.to_path_buf());
+    Ok(())
 }
 
 /// A folder of temporaries on the file system of the output, each with a name that was never used before.
@@ -53,7 +91,7 @@ impl Temps {
     /// Makes the folder `tmp` in a work folder and removes what an earlier process left in it.
     pub fn open(work_dir: &Path) -> Result<Temps> {
         let dir = work_dir.join("tmp");
-        ensure_dir(&dir)?;
+        ensure_dir(&dir, &mut BTreeSet::new())?;
         let entries = fs::read_dir(&dir).map_err(|e| Error::file(&dir, format!("cannot be listed: {e}")))?;
         for entry in entries.flatten() {
             if entry.file_type().is_ok_and(|t| t.is_file()) {
@@ -74,24 +112,36 @@ impl Temps {
         file.map(|f| (path, f)).map_err(|e| cannot_write(for_path, e))
     }
 
-    /// Gives a synced temporary its final name. The caller syncs the folder ([`sync_dir`]).
-    pub fn publish(&self, temp: &Path, path: &Path) -> Result<()> {
-        if let Some(parent) = path.parent() {
-            ensure_dir(parent)?;
-        }
+    /// Gives a synced temporary its final name; adds the folders to sync then ([`sync_dirs`]) to `changed`.
+    pub fn publish(&self, temp: &Path, path: &Path, changed: &mut BTreeSet<PathBuf>) -> Result<()> {
+        let parent = path.parent().unwrap_or(Path::new(""));
+        ensure_dir(parent, changed)?;
+        changed.insert(parent.to_path_buf());
         fs::rename(temp, path).map_err(|e| cannot_write(path, e))
     }
 
-    /// Writes a whole file under a temporary name, then gives it its own, durably.
-    pub fn write(&self, path: &Path, bytes: &[u8]) -> Result<()> {
-        let (temp, mut file) = self.create(path)?;
-        let written = file.write_all(bytes).and_then(|()| file.sync_all());
-        if let Err(e) = written {
-            let _ = fs::remove_file(&temp);
-            return Err(cannot_write(path, e));
+    /// Writes whole files under temporary names, then gives them their own, in this order, durably.
+    pub fn write(&self, files: &[(PathBuf, Vec<u8>)]) -> Result<()> {
+        let mut temps = Vec::new();
+        let mut handles = Vec::new();
+        let mut write = || {
+            for (path, bytes) in files {
+                let (temp, mut file) = self.create(path)?;
+                temps.push(temp);
+                file.write_all(bytes).map_err(|e| cannot_write(path, e))?;
+                handles.push(Arc::new(file));
+            }
+            sync_files(&handles, |i| files[i].0.clone())
+        };
+        if let Err(e) = write() {
+            temps.iter().for_each(|t| drop(fs::remove_file(t)));
+            return Err(e);
         }
-        self.publish(&temp, path)?;
-        sync_dir(path.parent().unwrap_or(Path::new("")))
+        let mut changed = BTreeSet::new();
+        for (temp, (path, _)) in temps.iter().zip(files) {
+            self.publish(temp, path, &mut changed)?;
+        }
+        sync_dirs(&changed)
     }
 }
 
@@ -107,8 +157,11 @@ mod tests {
         fs::write(work.join("tmp/77-left"), "half").unwrap();
         let temps = Temps::open(&work).unwrap();
         let path = folder.path().join("deep/er/file.json");
-        temps.write(&path, b"one").unwrap();
-        temps.write(&path, b"two").unwrap();
+        temps.write(&[(path.clone(), b"one".to_vec())]).unwrap();
+        let many = (0..9).map(|i| (folder.path().join(format!("deep/{i}")), vec![i])).collect::<Vec<_>>();
+        temps.write(&many).unwrap();
+        assert_eq!(fs::read(folder.path().join("deep/8")).unwrap(), [8]);
+        temps.write(&[(path.clone(), b"two".to_vec())]).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"two");
         assert_eq!(fs::read_dir(work.join("tmp")).unwrap().count(), 0);
     }
@@ -119,7 +172,7 @@ mod tests {
         let temps = Temps::open(&folder.path().join("w")).unwrap();
         fs::write(folder.path().join("plain"), "x").unwrap();
         let path = folder.path().join("plain/below");
-        let error = temps.write(&path, b"data").unwrap_err().to_string();
+        let error = temps.write(&[(path.clone(), b"data".to_vec())]).unwrap_err().to_string();
         assert!(error.contains("plain"), "{error}");
         let full = cannot_write(&path, io::Error::from_raw_os_error(libc::ENOSPC)).to_string();
         assert!(full.contains("no room left") && full.contains("below"), "{full}");

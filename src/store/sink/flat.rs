@@ -1,5 +1,6 @@
 //! One file with all voxels: written in place under another name, moved when it is whole.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::Read;
 use std::os::unix::fs::FileExt;
@@ -9,7 +10,7 @@ use serde_json::{Value, json};
 
 use super::encode::fill_bytes;
 use super::existing::{self, META};
-use super::files::{Temps, cannot_write, sync_dir};
+use super::files::{Temps, cannot_write, sync_dirs};
 use super::header::header;
 use super::{Encoded, SinkSpec};
 use crate::grid::Region;
@@ -70,14 +71,13 @@ impl Flat {
         let file = open(true)?;
         file.set_len(len).map_err(|e| cannot_write(&spec.path, e))?;
         file.write_all_at(&head, 0).and_then(|()| file.sync_all()).map_err(|e| cannot_write(&spec.path, e))?;
-        sync_dir(&work_dir)?;
         let flat = Flat { file, temps, work_dir, part, data_start: head.len() as u64 };
         flat.write_meta(json!({ "format": format!("{:?}", spec.format), "complete": false }))?;
         Ok(flat)
     }
 
     fn write_meta(&self, meta: Value) -> Result<()> {
-        self.temps.write(&self.work_dir.join(META), &serde_json::to_vec_pretty(&meta).unwrap_or_default())
+        self.temps.write(&[(self.work_dir.join(META), serde_json::to_vec_pretty(&meta).unwrap_or_default())])
     }
 
     /// Writes a box, row by row or in longer runs where rows join. Returns the bytes written.
@@ -133,6 +133,6 @@ impl Flat {
             "occlude": occlude,
         }))?;
         fs::rename(&self.part, &spec.path).map_err(|e| cannot_write(&spec.path, e))?;
-        sync_dir(spec.path.parent().unwrap_or(Path::new("")))
+        sync_dirs(&BTreeSet::from([spec.path.parent().unwrap_or(Path::new("")).to_path_buf()]))
     }
 }

@@ -142,7 +142,8 @@ impl Sink {
         let encoder = encode::Encoder::new(codec, spec.dtype, spec.fill);
         let files = if spec.is_zarr() {
             // The marker first: whatever is found later is then known as ours.
-            temps.write(&work_dir.join(existing::META), b"{ \"format\": \"zarr\", \"complete\": false }\n")?;
+            let marker = b"{ \"format\": \"zarr\", \"complete\": false }\n".to_vec();
+            temps.write(&[(work_dir.join(existing::META), marker)])?;
             Files::Zarr(Box::new(zarr::Zarr::create(&spec, temps)?))
         } else {
             Files::Flat(Box::new(flat::Flat::create(&spec, temps, work_dir, resume)?))

@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 use serde_json::Value;
 
-use super::files::{Temps, cannot_write, sync_dir};
+use super::files::{Temps, cannot_write, sync_dirs, sync_files};
 use super::{Encoded, SinkSpec, metadata};
 use crate::config::OutputFormat;
 use crate::grid::Region;
@@ -21,6 +21,9 @@ use crate::{Error, Result};
 /// File handles kept open at once: more shards than that are reopened as needed, so that limits of the system (often
 /// 1024 per process) are far away.
 const OPEN_FILES: usize = 64;
+
+/// Files that are synced together when many are committed.
+const COMMIT_BATCH: usize = 256;
 
 /// Offset and length of a chunk that is not stored.
 const MISSING: [u64; 2] = [u64::MAX; 2];
@@ -56,30 +59,33 @@ fn json_bytes(value: &Value) -> Vec<u8> {
     bytes
 }
 
+/// The group's metadata files.
+fn group_files(spec: &SinkSpec, occlude: Option<&Value>, windows: &[[f64; 2]]) -> Vec<(PathBuf, Vec<u8>)> {
+    let attributes = metadata::group_attributes(spec, occlude, windows);
+    if spec.format == OutputFormat::OmeZarr04 {
+        let group = b"{\n  \"zarr_format\": 2\n}\n".to_vec();
+        return vec![(spec.path.join(".zgroup"), group), (spec.path.join(".zattrs"), json_bytes(&attributes))];
+    }
+    vec![(spec.path.join("zarr.json"), json_bytes(&metadata::group_v3(attributes)))]
+}
+
 impl Zarr {
     /// Makes folders and metadata.
     pub fn create(spec: &SinkSpec, temps: Temps) -> Result<Zarr> {
         let zarr = Zarr { root: spec.path.clone(), temps, parts: Mutex::default(), files: Mutex::default() };
-        zarr.write_group(spec, None, &[])?;
+        // The group first: whatever is found below it is then known as this program's.
+        let mut files = group_files(spec, None, &[]);
         for level in 0..spec.pyramid.levels.len() {
             let dir = zarr.root.join(level.to_string());
             if spec.format == OutputFormat::OmeZarr04 {
-                zarr.temps.write(&dir.join(".zattrs"), &json_bytes(&metadata::array_attributes_v2(spec)))?;
-                zarr.temps.write(&dir.join(".zarray"), &json_bytes(&metadata::array_v2(spec, level)))?;
+                files.push((dir.join(".zattrs"), json_bytes(&metadata::array_attributes_v2(spec))));
+                files.push((dir.join(".zarray"), json_bytes(&metadata::array_v2(spec, level))));
             } else {
-                zarr.temps.write(&dir.join("zarr.json"), &json_bytes(&metadata::array_v3(spec, level)))?;
+                files.push((dir.join("zarr.json"), json_bytes(&metadata::array_v3(spec, level))));
             }
         }
+        zarr.temps.write(&files)?;
         Ok(zarr)
-    }
-
-    fn write_group(&self, spec: &SinkSpec, occlude: Option<&Value>, windows: &[[f64; 2]]) -> Result<()> {
-        let attributes = metadata::group_attributes(spec, occlude, windows);
-        if spec.format == OutputFormat::OmeZarr04 {
-            self.temps.write(&self.root.join(".zgroup"), b"{\n  \"zarr_format\": 2\n}\n")?;
-            return self.temps.write(&self.root.join(".zattrs"), &json_bytes(&attributes));
-        }
-        self.temps.write(&self.root.join("zarr.json"), &json_bytes(&metadata::group_v3(attributes)))
     }
 
     /// `LEVEL/c/[c/]z/y/x`, without the letter `c` for Zarr v2.
@@ -143,41 +149,48 @@ impl Zarr {
 
     /// Finishes every file of `level` that `region` touches, for all components.
     pub fn commit(&self, spec: &SinkSpec, level: usize, region: Region) -> Result<()> {
-        let mut folders = BTreeSet::new();
-        for component in 0..spec.components.unwrap_or(1) {
-            for cell in region.cells([0; 3], spec.file_shape()).iter() {
-                let key = (level, component, cell);
-                let found = lock(&self.parts).get(&key).map(Arc::clone);
-                if let Some(part) = found {
-                    let path = self.path_of(spec, key);
-                    if self.finish_part(spec, &lock(&part), &path)? {
-                        folders.extend(path.parent().map(Path::to_path_buf));
-                    }
-                    lock(&self.parts).remove(&key);
+        let cells = || region.cells([0; 3], spec.file_shape()).iter();
+        let keys: Vec<Key> =
+            (0..spec.components.unwrap_or(1)).flat_map(|c| cells().map(move |cell| (level, c, cell))).collect();
+        // All are written, then all synced, then all renamed, a batch at a time, so that handles stay few.
+        for batch in keys.chunks(COMMIT_BATCH) {
+            let mut ready = Vec::new();
+            let mut handles = Vec::new();
+            for &key in batch {
+                let Some(part) = lock(&self.parts).get(&key).map(Arc::clone) else { continue };
+                let path = self.path_of(spec, key);
+                if let Some((temp, file)) = self.close(spec, &lock(&part), &path)? {
+                    ready.push((temp, path));
+                    handles.push(file);
                 }
             }
+            sync_files(&handles, |i| ready[i].1.clone())?;
+            let mut folders = BTreeSet::new();
+            for (temp, path) in &ready {
+                self.temps.publish(temp, path, &mut folders)?;
+            }
+            sync_dirs(&folders)?;
+            let mut parts = lock(&self.parts);
+            batch.iter().for_each(|key| drop(parts.remove(key)));
         }
-        folders.iter().try_for_each(|f| sync_dir(f))
+        Ok(())
     }
 
-    /// Writes the index, syncs and renames. False where every chunk is missing: then there is no file.
-    fn finish_part(&self, spec: &SinkSpec, part: &Part, path: &Path) -> Result<bool> {
-        let Some(temp) = &part.temp else { return Ok(false) };
+    /// Writes the index. `None` where every chunk is missing: then there is no file.
+    fn close(&self, spec: &SinkSpec, part: &Part, path: &Path) -> Result<Option<(PathBuf, Arc<File>)>> {
+        let Some(temp) = &part.temp else { return Ok(None) };
         let file = self.open(temp, path)?;
         lock(&self.files).retain(|(p, _)| p != temp);
         if part.index.iter().all(|c| *c == MISSING) {
-            drop(file);
             std::fs::remove_file(temp).map_err(|e| cannot_write(path, e))?;
-            return Ok(false);
+            return Ok(None);
         }
         if spec.is_sharded() {
             let mut index: Vec<u8> = part.index.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
             index.extend(crc32c::crc32c(&index).to_le_bytes());
             file.write_all_at(&index, part.len).map_err(|e| cannot_write(path, e))?;
         }
-        file.sync_data().map_err(|e| cannot_write(path, e))?;
-        self.temps.publish(temp, path)?;
-        Ok(true)
+        Ok(Some((temp.clone(), file)))
     }
 
     fn keep_open(&self, temp: &Path, file: Arc<File>) {
@@ -207,6 +220,6 @@ impl Zarr {
             return Err(Error::file(path, "was written but not committed; the output is not complete"));
         }
         drop(parts);
-        self.write_group(spec, Some(occlude), windows)
+        self.temps.write(&group_files(spec, Some(occlude), windows))
     }
 }
