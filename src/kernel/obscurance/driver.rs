@@ -27,6 +27,8 @@ pub(super) struct Buffers<'a, K> {
     pub hits: [&'a mut [u32]; 2],
     /// One entry per plane of a sheet.
     pub stack: &'a mut [u32],
+    /// For the AVX-512 search.
+    pub turned: &'a mut [u8],
     /// One entry per plane of the source.
     pub shifts: [&'a mut [i32]; 2],
     /// One entry per answer.
@@ -53,7 +55,7 @@ pub(super) fn sweep_family<K: Key, S: Sink>(
     let axis = usize::from(family.axis == 1);
     let planes = volume.region.shape()[axis];
     let origin = volume.region.lo[axis];
-    let Buffers { sheet, hits, stack, shifts, tables } = buffers;
+    let Buffers { sheet, hits, stack, turned, shifts, tables } = buffers;
     for (shift, slope) in shifts.iter_mut().zip([family.slope[perm[1 - axis]], family.slope[perm[2]]]) {
         for (i, s) in shift[..planes].iter_mut().enumerate() {
             *s = displacement(slope, origin + i as i64) as i32;
@@ -76,9 +78,9 @@ pub(super) fn sweep_family<K: Key, S: Sink>(
     let job = Job { volume, tile: in_frame(tile, perm), axis, visit };
     let [forward, backward] = hits;
     if reach <= u8::MAX as usize {
-        run::<K, u8, S>(level, &job, sheet, [bytes_of(forward), bytes_of(backward)], stack, sink);
+        run::<K, u8, S>(level, &job, sheet, [bytes_of(forward), bytes_of(backward)], stack, turned, sink);
     } else {
-        run::<K, u32, S>(level, &job, sheet, [forward, backward], stack, sink);
+        run::<K, u32, S>(level, &job, sheet, [forward, backward], stack, turned, sink);
     }
 }
 
@@ -120,6 +122,7 @@ fn run<K: Key, H: Hit, S: Sink>(
     sheet: &mut [K],
     hits: [&mut [H]; 2],
     stack: &mut [u32],
+    turned: &mut [u8],
     sink: &mut S,
 ) {
     let Job { volume, tile, axis, visit } = job;
@@ -151,9 +154,9 @@ fn run<K: Key, H: Hit, S: Sink>(
             for (way, hits) in [&mut *forward, &mut *backward].into_iter().enumerate() {
                 if visit.family.senses[way].is_some() {
                     answers[way] = &mut hits[..count];
-                    scan::next_greater(level, sheet, local.clone(), visit.reach, way == 0, answers[way], stack);
                 }
             }
+            scan::both(level, sheet, local, visit.reach, answers.each_mut().map(|a| &mut **a), stack, turned);
             for (row, plane) in queries.enumerate() {
                 let start = s_c + shift_c[plane] as i64;
                 let (lo, hi) = (start.max(tile.lo[2]), (start + LANES as i64).min(tile.hi[2]));

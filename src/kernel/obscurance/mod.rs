@@ -6,6 +6,7 @@
 //! | `keys` | voxels to padded, order-preserving unsigned keys |
 //! | `driver` | tiles, sheets, senses |
 //! | `scan` | next greater key on 64 lines |
+//! | `wide` | the same by AVX-512 |
 //! | `sinks` | what is summed |
 //! | `reference` | all of it by the definition |
 
@@ -18,6 +19,8 @@ mod scan;
 mod sinks;
 #[cfg(test)]
 mod tests;
+#[cfg(target_arch = "x86_64")]
+mod wide;
 
 use super::Context;
 use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
@@ -138,6 +141,7 @@ impl Prepared {
         let (sheet, bytes) = carve::<T::Key>(bytes, sizes.sheet * LANES);
         let (hits, bytes) = carve_all::<u32, 2>(bytes, sizes.queries * LANES);
         let (stack, bytes) = carve::<u32>(bytes, sizes.sheet);
+        let (turned, bytes) = carve::<u8>(bytes, sizes.turned(size_of::<T>()));
         let (shifts, bytes) = carve_all::<i32, 2>(bytes, sizes.extent);
         let (tables, bytes) = carve_all::<u32, 2>(bytes, sizes.extent + 1);
 
@@ -153,7 +157,7 @@ impl Prepared {
             volumes: [natural, swapped],
             src_box,
             dst_box,
-            buffers: Buffers { sheet, hits, stack, shifts, tables },
+            buffers: Buffers { sheet, hits, stack, turned, shifts, tables },
         };
         let missing = keys::missing_of::<T>(self.params.missing);
         let gone =
@@ -273,6 +277,14 @@ struct Sizes {
 }
 
 impl Sizes {
+    /// Bytes of scratch of the AVX-512 search.
+    fn turned(&self, key: usize) -> usize {
+        #[cfg(target_arch = "x86_64")]
+        return wide::scratch_bytes(self.sheet, self.queries, key);
+        #[cfg(not(target_arch = "x86_64"))]
+        return 0 * key;
+    }
+
     fn bytes(&self, key: usize, colour: bool, normal: bool) -> usize {
         let line = |bytes: usize| bytes.next_multiple_of(64);
         line(self.keys[0] * key)
@@ -280,6 +292,7 @@ impl Sizes {
             + line(self.sheet * LANES * key)
             + 2 * line(self.queries * LANES * 4)
             + line(self.sheet * 4)
+            + line(self.turned(key))
             + 2 * line(self.extent * 4)
             + 2 * line((self.extent + 1) * 4)
             + if normal { 0 } else { 2 * line(self.tile * 4) }

@@ -3,22 +3,43 @@
 use std::ops::Range;
 
 use super::keys::{Key, LANES};
+use crate::kernel::simd::Level;
 
 /// Steps without an occluder, per query: small enough to be stored for two senses of a sheet.
 pub(super) trait Hit: Copy + Default + Send + Sync + 'static {
     fn of(steps: usize) -> Self;
     fn steps(self) -> usize;
+    /// The same slice if answers are bytes, else an empty one.
+    fn bytes(answers: &mut [Self]) -> &mut [u8];
 }
 
-macro_rules! hit {
-    ($($t:ty),*) => {$(impl Hit for $t {
-        #[inline(always)]
-        fn of(steps: usize) -> Self { steps as $t }
-        #[inline(always)]
-        fn steps(self) -> usize { self as usize }
-    })*};
+impl Hit for u8 {
+    #[inline(always)]
+    fn of(steps: usize) -> Self {
+        steps as u8
+    }
+    #[inline(always)]
+    fn steps(self) -> usize {
+        self as usize
+    }
+    fn bytes(answers: &mut [u8]) -> &mut [u8] {
+        answers
+    }
 }
-hit!(u8, u32);
+
+impl Hit for u32 {
+    #[inline(always)]
+    fn of(steps: usize) -> Self {
+        steps as u32
+    }
+    #[inline(always)]
+    fn steps(self) -> usize {
+        self as usize
+    }
+    fn bytes(_: &mut [u32]) -> &mut [u8] {
+        &mut []
+    }
+}
 
 /// Queries that share one pass over the planes ahead.
 const QUERIES: usize = 4;
@@ -142,6 +163,30 @@ pub(super) fn stacked<K: Key, H: Hit>(
             }
             stack[top] = plane as u32;
             top += 1;
+        }
+    }
+}
+
+/// Answers of both senses (growing plane numbers first); an empty slice of hits is a sense that is not asked for.
+pub(super) fn both<K: Key, H: Hit>(
+    level: Level,
+    sheet: &[K],
+    queries: Range<usize>,
+    reach: usize,
+    hits: [&mut [H]; 2],
+    stack: &mut [u32],
+    turned: &mut [u8],
+) {
+    #[cfg(target_arch = "x86_64")]
+    if level == Level::Avx512 && size_of::<H>() == 1 {
+        let hits = hits.map(H::bytes);
+        // SAFETY: the level says that the CPU has AVX-512.
+        return unsafe { super::wide::next_greater(sheet, queries, reach, hits, turned) };
+    }
+    let _ = turned;
+    for (way, hits) in hits.into_iter().enumerate() {
+        if !hits.is_empty() {
+            next_greater(level, sheet, queries.clone(), reach, way == 0, hits, stack);
         }
     }
 }

@@ -89,8 +89,86 @@ where
     sweep_part(Level::detect(), p, field, field.region, None, None).openness
 }
 
-fn bits(v: &[f32]) -> Vec<u32> {
-    v.iter().map(|v| v.to_bits()).collect()
+fn bits(v: &[f32]) -> Bits {
+    Bits(v.iter().map(|v| v.to_bits()).collect())
+}
+
+/// Bits of floats; shows only how many there are.
+#[derive(PartialEq)]
+struct Bits(Vec<u32>);
+
+impl std::fmt::Debug for Bits {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        write!(f, "{} floats", self.0.len())
+    }
+}
+
+#[test]
+fn every_search_finds_the_next_greater_key() {
+    fn check<K: Key>(of: impl Fn(u64) -> K) {
+        let mut noise = Noise(77);
+        for (planes, from, to, reach) in [
+            (1, 0, 1, 0),
+            (1, 0, 1, 1),
+            (5, 0, 5, 4),
+            (70, 3, 70, 64),
+            (200, 64, 130, 63),
+            (256, 0, 256, 255),
+            (300, 100, 101, 150),
+            (333, 17, 290, 40),
+            (700, 0, 600, 255),
+            (700, 30, 700, 699),
+        ] {
+            let modulus = [3, 40, 1 << 20][(planes + reach) % 3];
+            let mut sheet: Vec<K> = (0..planes * LANES).map(|_| of(noise.next() % modulus)).collect();
+            for lane in 0..8 {
+                // Falling, rising and constant lines.
+                let slope = |i: usize| [i as u64, (planes - i) as u64, 9][lane % 3];
+                (0..planes).for_each(|i| sheet[i * LANES + 8 * lane] = of(slope(i)));
+            }
+            let key = |plane: usize, lane: usize| sheet[plane * LANES + lane];
+            let naive = |plane: usize, lane: usize, ahead: bool| {
+                let at = |j: usize| if ahead { plane + j } else { plane.wrapping_sub(j) };
+                let mut free = (1..=reach).take_while(|&j| at(j) < planes && key(at(j), lane) <= key(plane, lane));
+                let steps = free.by_ref().count();
+                if steps < reach && at(steps + 1) < planes { steps } else { reach }
+            };
+            let mut stack = vec![0; planes];
+            #[cfg(target_arch = "x86_64")]
+            let mut scratch = vec![0u64; super::wide::scratch_bytes(planes, to - from, size_of::<K>()) / 8 + 8];
+            for level in Level::available() {
+                let mut hits = [0, 1].map(|_| vec![u32::MAX; (to - from) * LANES]);
+                if reach <= 255 {
+                    let mut bytes = hits.each_ref().map(|h| vec![7u8; h.len()]);
+                    let [f, b] = bytes.each_mut();
+                    // SAFETY: bytes of integers.
+                    let (_, turned, _) = unsafe { scratch.align_to_mut::<[u64; 8]>() };
+                    // SAFETY: as above.
+                    let (_, turned, _) = unsafe { turned.align_to_mut::<u8>() };
+                    let start = turned.as_ptr().align_offset(64);
+                    super::scan::both(level, &sheet, from..to, reach, [f, b], &mut stack, &mut turned[start..]);
+                    for (h, b) in hits.iter_mut().zip(&bytes) {
+                        h.iter_mut().zip(b).for_each(|(h, b)| *h = *b as u32);
+                    }
+                } else {
+                    let [f, b] = hits.each_mut();
+                    super::scan::both(level, &sheet, from..to, reach, [f, b], &mut stack, &mut []);
+                }
+                for (ahead, hits) in [true, false].into_iter().zip(&hits) {
+                    for (i, &got) in hits.iter().enumerate() {
+                        let (plane, lane) = (from + i / LANES, i % LANES);
+                        let want = naive(plane, lane, ahead);
+                        let what = (size_of::<K>(), level, planes, from, to, reach, ahead, plane, lane);
+                        assert_eq!(got as usize, want, "{what:?}");
+                    }
+                }
+            }
+        }
+    }
+    check::<u8>(|v| v as u8);
+    check::<u16>(|v| v as u16);
+    check::<u32>(|v| (v as u32) << 8);
+    check::<u64>(|v| v << 30);
 }
 
 /// What the fixed-point sum of the reference's hits must give, bit for bit.
@@ -250,7 +328,7 @@ fn bricks_never_show() {
         for brick in bricks {
             let part = sweep_part(Level::Baseline, &p, &field, brick, Some(&colour), gradient);
             let at: Vec<usize> = brick.iter().map(|q| field.index(q).unwrap()).collect();
-            let of = |v: &[f32]| at.iter().map(|&i| v[i].to_bits()).collect::<Vec<_>>();
+            let of = |v: &[f32]| Bits(at.iter().map(|&i| v[i].to_bits()).collect());
             assert_eq!(bits(&part.openness), of(&whole.openness));
             (0..3).for_each(|c| assert_eq!(bits(&part.rgb[c]), of(&whole.rgb[c])));
         }

@@ -1,0 +1,196 @@
+//! Speed and accuracy of obscurance sweeps, one thread.
+//!
+//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT]`: CPU seconds of the best
+//! of several sweeps over a cube of 256^3 voxels, by field, element type, reach and instruction set; or, with
+//! `--accuracy`, errors of direction sets against 6000 directions.
+
+use occlude::brick::Scratch;
+use occlude::grid::{AnyView, AnyViewMut, Region, Shape, View, ViewMut};
+use occlude::kernel::Context;
+use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
+use occlude::kernel::simd::Level;
+use occlude::stage::{DirectionSet, DirectionWeights, Rho};
+
+fn params() -> ObscuranceParams {
+    ObscuranceParams {
+        directions: 42,
+        set: DirectionSet::Icosahedron,
+        weights: DirectionWeights::Uniform,
+        rho: Rho::Sqrt,
+        max_distance: 64.0,
+        spacing: [1.0; 3],
+        flipped: false,
+        missing: None,
+        ambient: [1.0; 3],
+    }
+}
+
+/// Seconds that this thread has computed: other users of the machine do not count.
+fn cpu_seconds() -> f64 {
+    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `t` is a valid timespec.
+    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
+    t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
+}
+
+fn hash(p: [i64; 3]) -> u64 {
+    let mut h = (p[0] as u64) << 42 ^ (p[1] as u64) << 21 ^ p[2] as u64;
+    for _ in 0..2 {
+        h = (h ^ h >> 31).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    }
+    h >> 40
+}
+
+/// Values of a field in [0, 1).
+fn field(name: &str, shape: Shape) -> Vec<f64> {
+    let edge = shape[2] as f64;
+    let value = |p: [i64; 3]| {
+        let [z, y, x] = p.map(|c| c as f64);
+        let noise = hash(p) as f64 / (1 << 24) as f64;
+        match name {
+            "noise" => noise,
+            "ramp x" => x / edge,
+            "ramp" => (x + y + z) / (3.0 * edge),
+            "falling" => 1.0 - (x + y + z + 1.0) / (3.0 * edge),
+            "plateaus" => hash(p.map(|c| c / 40)) as f64 / (1 << 24) as f64,
+            "sparse" => {
+                let tube = |a: f64, b: f64| ((a * 0.071).sin() + (b * 0.053).cos()).abs();
+                if tube(x, y) < 0.06 || tube(y, z) < 0.05 { 0.5 + 0.5 * noise } else { 0.0 }
+            }
+            "ct" => {
+                let wave = (x * 0.05).sin() * (y * 0.043).cos() + (z * 0.031).sin() * (x * 0.017).cos();
+                let ball = ((x - 128.0).powi(2) + (y - 128.0).powi(2) + (z - 128.0).powi(2)).sqrt();
+                let body = if ball < 110.0 { 0.35 + 0.15 * wave } else { 0.02 };
+                (body + 0.06 * noise + if (ball - 95.0).abs() < 4.0 { 0.35 } else { 0.0 }).clamp(0.0, 0.999)
+            }
+            _ => panic!("no field {name}"),
+        }
+    };
+    Region::whole(shape).iter().map(value).collect()
+}
+
+/// CPU seconds of the best of `runs` sweeps over the whole volume, and a checksum of the result.
+fn time(level: Level, p: &ObscuranceParams, view: AnyView, runs: usize) -> (f64, u64) {
+    let shape = view.shape();
+    let whole = Region::whole(shape);
+    let prepared = Prepared::new(p);
+    let mut out = vec![0f32; whole.voxels()];
+    let mut scratch = Scratch::new();
+    let mut best = f64::INFINITY;
+    for _ in 0..runs {
+        let io = ObscuranceIo {
+            colour: None,
+            normal: None,
+            openness: Some(AnyViewMut::F32(ViewMut::dense(&mut out, shape))),
+            rgb: None,
+        };
+        let start = cpu_seconds();
+        prepared.sweep(view, whole, whole, io, &mut Context { level, scratch: &mut scratch });
+        best = best.min(cpu_seconds() - start);
+    }
+    let sum = out.iter().fold(0u64, |h, v| h.rotate_left(5).wrapping_add(v.to_bits() as u64));
+    (best, sum)
+}
+
+fn row(name: &str, kind: &str, level: Level, p: &ObscuranceParams, view: AnyView) {
+    let voxels = view.shape().iter().product::<usize>() as f64;
+    let (seconds, sum) = time(level, p, view, 3);
+    let each = seconds * 1e9 / voxels / p.directions as f64;
+    println!(
+        "{name:<10} {kind:<4} {level:<9?} dmax {:>4}  {:>3} directions  {seconds:7.3} s  {each:6.3} ns/voxel/direction  {sum:016x}",
+        p.max_distance, p.directions
+    );
+}
+
+fn speed(edge: usize, only: Option<&str>) {
+    let shape = [edge; 3];
+    let wanted = |name: &str| only.is_none_or(|o| name.contains(o));
+    for name in ["ct", "sparse", "noise", "ramp x", "ramp", "falling", "plateaus"] {
+        let values = field(name, shape);
+        let u8s: Vec<u8> = values.iter().map(|v| (v * 256.0) as u8).collect();
+        let view = AnyView::U8(View::dense(&u8s, shape));
+        for max_distance in [8.0, 64.0, 256.0] {
+            let label = format!("u8 {name} {max_distance}");
+            if wanted(&label) {
+                row(name, "u8", Level::detect(), &ObscuranceParams { max_distance, ..params() }, view);
+            }
+        }
+        if name == "ct" || name == "noise" {
+            for level in Level::available() {
+                if level != Level::detect() && wanted(&format!("u8 {name} {level:?}")) {
+                    row(name, "u8", level, &params(), view);
+                }
+            }
+            let u16s: Vec<u16> = values.iter().map(|v| (v * 65536.0) as u16).collect();
+            let f32s: Vec<f32> = values.iter().map(|v| *v as f32).collect();
+            for max_distance in [64.0, 256.0] {
+                let p = ObscuranceParams { max_distance, ..params() };
+                if wanted(&format!("u16 {name} {max_distance}")) {
+                    row(name, "u16", Level::detect(), &p, AnyView::U16(View::dense(&u16s, shape)));
+                }
+                if wanted(&format!("f32 {name} {max_distance}")) {
+                    row(name, "f32", Level::detect(), &p, AnyView::F32(View::dense(&f32s, shape)));
+                }
+            }
+        }
+    }
+}
+
+/// Root-mean-square and largest difference of each set from 6000 Fibonacci directions.
+fn accuracy() {
+    let shape = [96; 3];
+    for name in ["ct", "sparse"] {
+        let data: Vec<u8> = field(name, shape).iter().map(|v| (v * 256.0) as u8).collect();
+        for rho in [Rho::Step, Rho::Sqrt] {
+            let open = |set, directions, weights| {
+                let p = ObscuranceParams { set, directions, weights, rho, max_distance: 32.0, ..params() };
+                let mut out = vec![0f32; data.len()];
+                let io = ObscuranceIo {
+                    colour: None,
+                    normal: None,
+                    openness: Some(AnyViewMut::F32(ViewMut::dense(&mut out, shape))),
+                    rgb: None,
+                };
+                let whole = Region::whole(shape);
+                let mut scratch = Scratch::new();
+                let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+                Prepared::new(&p).sweep(AnyView::U8(View::dense(&data, shape)), whole, whole, io, &mut cx);
+                out
+            };
+            let truth = open(DirectionSet::Fibonacci, 6000, DirectionWeights::Uniform);
+            let (ico, fib) = (DirectionSet::Icosahedron, DirectionSet::Fibonacci);
+            for (set, n) in [(ico, 12), (ico, 42), (ico, 162), (fib, 12), (fib, 42), (fib, 64), (fib, 162), (fib, 642)]
+            {
+                for weights in [DirectionWeights::Uniform, DirectionWeights::Voronoi] {
+                    if set == fib && weights == DirectionWeights::Voronoi {
+                        continue;
+                    }
+                    let got = open(set, n, weights);
+                    let differ = got.iter().zip(&truth).map(|(a, b)| (*a as f64 - *b as f64).abs());
+                    let rmse = (differ.clone().map(|d| d * d).sum::<f64>() / data.len() as f64).sqrt();
+                    let max = differ.fold(0.0, f64::max);
+                    println!("{name:<8} {rho:<6?} {set:<12?} {n:>4} {weights:<8?} rmse {rmse:.4}  max {max:.4}");
+                }
+            }
+        }
+    }
+}
+
+fn main() {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let after = |key: &str| args.iter().position(|a| a == key).map(|i| &args[i + 1..]);
+    if after("--accuracy").is_some() {
+        return accuracy();
+    }
+    if let Some([file, z, y, x, ..]) = after("--raw") {
+        let shape = [z, y, x].map(|n| n.parse().expect("an extent"));
+        let data = std::fs::read(file).expect("a raw u8 volume");
+        for max_distance in [64.0, 256.0] {
+            let p = ObscuranceParams { max_distance, ..params() };
+            row("raw", "u8", Level::detect(), &p, AnyView::U8(View::dense(&data, shape)));
+        }
+        return;
+    }
+    let edge = after("--edge").map_or(256, |a| a[0].parse().expect("an edge"));
+    speed(edge, after("--only").map(|a| a[0].as_str()));
+}
