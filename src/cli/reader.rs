@@ -116,14 +116,10 @@ pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attribut
 /// A headerless output of this program: shape and type stand in the file beside it.
 fn describe(path: &Path, given: &RawArgs, attributes: &Attributes) -> RawArgs {
     let raw_name = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("raw"));
-    let Some(occlude) = attributes.occlude.as_ref().filter(|_| raw_name && given.shape.is_none()) else {
-        return given.clone();
-    };
-    let sizes = occlude.get("shape").and_then(|s| s.as_array());
-    let sizes = sizes.map(|s| s.iter().filter_map(|n| n.as_u64()).map(|n| n as usize).collect::<Vec<_>>());
-    let dtype = occlude.get("dtype").and_then(|d| d.as_str()).and_then(DType::parse);
-    match (sizes.and_then(|s| <[usize; 3]>::try_from(s).ok()), given.dtype.or(dtype)) {
-        (Some(shape), Some(dtype)) => RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() },
+    match (attributes.shape, given.dtype.or(attributes.dtype)) {
+        (Some(shape), Some(dtype)) if raw_name && given.shape.is_none() => {
+            RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() }
+        }
         _ => given.clone(),
     }
 }

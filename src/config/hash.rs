@@ -30,16 +30,7 @@ pub fn config_hash(config: &Config) -> String {
     for o in &config.outputs {
         parts.push(format!(
             "output {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?}",
-            o.name,
-            o.format,
-            o.from,
-            o.dtype,
-            o.range,
-            o.chunk,
-            o.shard,
-            o.codec,
-            o.levels,
-            o.reduce
+            o.name, o.format, o.from, o.dtype, o.range, o.chunk, o.shard, o.codec, o.levels, o.reduce
         ));
     }
     parts.sort();

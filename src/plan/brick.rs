@@ -27,7 +27,11 @@ pub struct BrickChoice {
 impl BrickChoice {
     /// Worst case by formula.
     pub fn peak(&self, threads: usize) -> u64 {
-        memory::FIXED + memory::PER_THREAD * threads as u64 + self.parked + self.bytes * self.in_flight as u64 + self.cache
+        memory::FIXED
+            + memory::PER_THREAD * threads as u64
+            + self.parked
+            + self.bytes * self.in_flight as u64
+            + self.cache
     }
 }
 
@@ -38,7 +42,10 @@ pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<BrickChoice
         let why = if shape == asked {
             "as asked".to_string()
         } else {
-            format!("asked for {asked:?}; bricks are multiples of {:?} and at most a task of {:?}", group.align, group.task)
+            format!(
+                "asked for {asked:?}; bricks are multiples of {:?} and at most a task of {:?}",
+                group.align, group.task
+            )
         };
         return fit(plan, group, shape, why).ok_or_else(|| refuse(plan, group, shape, config));
     }
@@ -76,7 +83,8 @@ fn round_up(asked: Shape, align: Shape, task: Shape) -> Shape {
 fn candidates(group: &Group) -> Vec<Shape> {
     let shape = group.region.shape();
     let axis = |a: usize| {
-        let unit = if group.chunk[a] % group.align[a] == 0 && group.chunk[a] > 1 { group.chunk[a] } else { group.align[a] };
+        let unit =
+            if group.chunk[a] % group.align[a] == 0 && group.chunk[a] > 1 { group.chunk[a] } else { group.align[a] };
         let unit = if unit < 16 { unit * 16usize.div_ceil(unit) } else { unit };
         let mut edges: Vec<usize> = Vec::new();
         let mut edge = unit;
@@ -148,7 +156,8 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     let starved = if choice.in_flight > plan.threads { 1.0 } else { 1.5 + threads / choice.in_flight as f64 };
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels; beyond, the pipeline only gets coarser.
     let large = 1.0 + (shape.iter().product::<usize>() as f64 / 16e6).powi(2) * 0.1;
-    let partial_chunks = if (0..3).any(|a| shape[a] % group.chunk[a] != 0 && shape[a] < region[a]) { 1.15 } else { 1.0 };
+    let partial_chunks =
+        if (0..3).any(|a| shape[a] % group.chunk[a] != 0 && shape[a] < region[a]) { 1.15 } else { 1.0 };
     let overhead = 1.0 + 20_000.0 / shape.iter().product::<usize>() as f64;
     choice.amplification.powf(0.8) * rounds * short_rows * starved * large * partial_chunks * overhead
 }
@@ -173,5 +182,9 @@ fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
 
 /// A size for people.
 pub fn mib(bytes: u64) -> String {
-    if bytes >= 10 << 30 { format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64) } else { format!("{:.1} MiB", bytes as f64 / (1 << 20) as f64) }
+    if bytes >= 10 << 30 {
+        format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64)
+    } else {
+        format!("{:.1} MiB", bytes as f64 / (1 << 20) as f64)
+    }
 }

@@ -50,7 +50,11 @@ fn text(config: &Config, plan: &Plan, sources: &[Source]) -> String {
         let spec = &output.spec;
         let _ = writeln!(w, "output {}: {} as {}", spec.name, spec.path.display(), spec.dtype);
         for (d, level) in spec.pyramid.levels.iter().enumerate() {
-            let _ = writeln!(w, "  level {d}: {:?} scale {:?} translation {:?}", level.shape, level.scale, level.translation);
+            let _ = writeln!(
+                w,
+                "  level {d}: {:?} scale {:?} translation {:?}",
+                level.shape, level.scale, level.translation
+            );
         }
     }
     for warning in &plan.warnings {

@@ -90,20 +90,58 @@ pub struct Step {
 /// What a step computes; `channel` lists go with [`Step::outputs`].
 #[derive(Debug, Clone)]
 pub enum StepKind {
-    Window { params: WindowParams, channels: Vec<WindowChannel> },
-    Rank { params: WindowParams, shape: WindowShape, ties: Ties },
-    Gaussian { sigma: [f64; 3], channels: Vec<Moment> },
-    Gradient { size: usize, weight: GradientWeight, spacing: [f64; 3], channels: Vec<GradientChannel> },
-    Transfer { points: Vec<TransferPoint>, channels: Vec<TransferChannel> },
-    OpennessWindow { low: f64, high: f64, mode: WindowMode },
-    ModulateByVariance { sigma_max2: f64 },
-    ModulateBySaliency { threshold: f64, gain: f64 },
-    AmbientLight { k: f64 },
-    Combine { kind: CombineKind },
+    Window {
+        params: WindowParams,
+        channels: Vec<WindowChannel>,
+    },
+    Rank {
+        params: WindowParams,
+        shape: WindowShape,
+        ties: Ties,
+    },
+    Gaussian {
+        sigma: [f64; 3],
+        channels: Vec<Moment>,
+    },
+    Gradient {
+        size: usize,
+        weight: GradientWeight,
+        spacing: [f64; 3],
+        channels: Vec<GradientChannel>,
+    },
+    Transfer {
+        points: Vec<TransferPoint>,
+        channels: Vec<TransferChannel>,
+    },
+    OpennessWindow {
+        low: f64,
+        high: f64,
+        mode: WindowMode,
+    },
+    ModulateByVariance {
+        sigma_max2: f64,
+    },
+    ModulateBySaliency {
+        threshold: f64,
+        gain: f64,
+    },
+    AmbientLight {
+        k: f64,
+    },
+    Combine {
+        kind: CombineKind,
+    },
     /// Inputs: density, then colour and normal where present.
-    Obscurance { params: ObscuranceParams, channels: Vec<ObscuranceChannel>, colour: Option<WireId>, normal: Option<WireId> },
+    Obscurance {
+        params: ObscuranceParams,
+        channels: Vec<ObscuranceChannel>,
+        colour: Option<WireId>,
+        normal: Option<WireId>,
+    },
     /// Divides by a number from a pre-pass (0 stays 0).
-    Divide { by: GlobalId },
+    Divide {
+        by: GlobalId,
+    },
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

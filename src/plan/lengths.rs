@@ -22,7 +22,10 @@ fn lattice_unit(lattice: &Lattice, key: &str, given: &str) -> Result<f64> {
 fn physical(value: f64, unit: &str, lattice: &Lattice, key: &str) -> Result<f64> {
     let given = format!("{value} {unit}");
     let metres = units::to_metres(unit).ok_or_else(|| {
-        Error::config(key, format!("\"{given}\" has an unknown unit; accepted: m, cm, mm, um, nm, angstrom and UDUNITS names"))
+        Error::config(
+            key,
+            format!("\"{given}\" has an unknown unit; accepted: m, cm, mm, um, nm, angstrom and UDUNITS names"),
+        )
     })?;
     Ok(value * metres / lattice_unit(lattice, key, &given)?)
 }

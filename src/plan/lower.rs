@@ -113,7 +113,8 @@ impl Lowering<'_> {
             self.wanted[stage].push(channel);
         }
         // Levels of a variance pool the means as well.
-        let companion = ["variance", "std"].contains(&channel) && op_channels(self.config.stages[stage].op.word()).contains(&"mean");
+        let companion = ["variance", "std"].contains(&channel)
+            && op_channels(self.config.stages[stage].op.word()).contains(&"mean");
         if companion && !self.wanted[stage].contains(&"mean") {
             self.wanted[stage].push("mean");
         }
@@ -132,7 +133,10 @@ impl Lowering<'_> {
             Target::Stage(stage, channel) => {
                 self.stage(stage)?;
                 self.stage_wires.get(&(stage, channel)).copied().ok_or_else(|| {
-                    self.error(place, format!("\"{}\" is an occlusion map: it can be written, not read by a stage", reference.name))
+                    self.error(
+                        place,
+                        format!("\"{}\" is an occlusion map: it can be written, not read by a stage", reference.name),
+                    )
                 })
             }
         }
@@ -143,13 +147,8 @@ impl Lowering<'_> {
             return Ok(*wire);
         }
         let (node, info): (&Input, &VolumeInfo) = (&self.config.inputs[input], &self.infos[input]);
-        let lattice = Lattice {
-            input,
-            shape: info.shape,
-            spacing: info.spacing,
-            origin: info.origin,
-            unit: info.unit.clone(),
-        };
+        let lattice =
+            Lattice { input, shape: info.shape, spacing: info.spacing, origin: info.origin, unit: info.unit.clone() };
         self.out.graph.lattices.push(lattice);
         let missing = info.nodata.filter(|_| !info.dtype.is_float()).filter(|v| v.fract() == 0.0 && v.abs() < 1e15);
         let wire = Wire {
@@ -221,7 +220,10 @@ impl Lowering<'_> {
             Op::OcclusionMap { input, start_level } => {
                 let src = self.wire(input, place)?;
                 if node.where_.is_some() {
-                    return Err(Error::config(key("where"), "an occlusion_map takes no `where`: its levels pool every voxel"));
+                    return Err(Error::config(
+                        key("where"),
+                        "an occlusion_map takes no `where`: its levels pool every voxel",
+                    ));
                 }
                 self.out.maps.insert(index, (src, *start_level));
                 Ok(())
@@ -235,7 +237,9 @@ impl Lowering<'_> {
                 let kind = self.gradient_kind(src, *size, *weight, channels);
                 self.push_step(index, node, kind, vec![src], [size / 2; 3], Border::Nearest, wanted)
             }
-            Op::Saliency { input, size, weight, scale_max } => self.saliency(index, node, input, *size, *weight, *scale_max),
+            Op::Saliency { input, size, weight, scale_max } => {
+                self.saliency(index, node, input, *size, *weight, *scale_max)
+            }
             Op::Obscurance(op) => self.obscurance(index, node, op, wanted),
             Op::Transfer { input, points } => {
                 let src = self.wire(input, place)?;
@@ -320,7 +324,13 @@ impl Lowering<'_> {
         Ok(())
     }
 
-    fn gradient_kind(&self, src: WireId, size: usize, weight: GradientWeight, channels: Vec<GradientChannel>) -> StepKind {
+    fn gradient_kind(
+        &self,
+        src: WireId,
+        size: usize,
+        weight: GradientWeight,
+        channels: Vec<GradientChannel>,
+    ) -> StepKind {
         StepKind::Gradient { size, weight, spacing: self.lattice(src).spacing, channels }
     }
 
@@ -438,7 +448,9 @@ impl Lowering<'_> {
                 let (a, b) = (&self.out.graph.wires[inputs[0]].name, &self.out.graph.wires[w].name);
                 return Err(Error::config(
                     node.place.key.clone(),
-                    format!("\"{a}\" has the shape {first:?} and \"{b}\" {shape:?}; a stage reads volumes of one shape"),
+                    format!(
+                        "\"{a}\" has the shape {first:?} and \"{b}\" {shape:?}; a stage reads volumes of one shape"
+                    ),
                 ));
             }
         }
@@ -479,7 +491,9 @@ impl Lowering<'_> {
         let src = &self.out.graph.wires[inputs[0]];
         let most = inputs.iter().map(|&w| self.out.graph.wires[w].components).max().unwrap_or(1);
         let (components, component_names) = match channel {
-            "rgb" if !matches!(node.op, Op::AmbientLight { .. }) => (3, ["red", "green", "blue"].map(String::from).to_vec()),
+            "rgb" if !matches!(node.op, Op::AmbientLight { .. }) => {
+                (3, ["red", "green", "blue"].map(String::from).to_vec())
+            }
             "rgb" => (most, ["red", "green", "blue"].map(String::from).to_vec()),
             "vector" => (3, ["z", "y", "x"].map(String::from).to_vec()),
             _ => (most, src.component_names.clone()),

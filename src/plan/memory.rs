@@ -36,7 +36,8 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
         let last_use = |w: WireId| {
             group.sinks.contains(&w) || group.steps[at + 1..].iter().any(|&t| reads(&plan.graph.steps[t], w))
         };
-        let is_map = |w: WireId| group.outputs.iter().any(|&o| plan.outputs[o].map.as_ref().is_some_and(|m| m.source == w));
+        let is_map =
+            |w: WireId| group.outputs.iter().any(|&o| plan.outputs[o].map.as_ref().is_some_and(|m| m.source == w));
         live.retain(|(w, _)| last_use(*w) || is_map(*w));
     }
     let sinks: u64 = group.outputs.iter().map(|&o| output_bytes(plan, group, &plan.outputs[o], shape)).sum();
@@ -71,13 +72,9 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Rank { params, shape, .. } => rank::scratch_bytes(dtype, src, dst, params, *shape),
         StepKind::Gaussian { sigma, channels } => gaussian::scratch_bytes(dtype, src, dst, *sigma, channels.len() > 1),
         StepKind::Gradient { size, .. } => gradient::scratch_bytes(dtype, src, dst, *size),
-        StepKind::Obscurance { params, colour, normal, .. } => obscurance::Prepared::new(params).scratch_bytes(
-            dtype,
-            src,
-            dst,
-            colour.is_some(),
-            normal.is_some(),
-        ),
+        StepKind::Obscurance { params, colour, normal, .. } => {
+            obscurance::Prepared::new(params).scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
+        }
         _ => 0,
     };
     let mask = if step.mask.is_some() { dst.iter().product() } else { 0 };

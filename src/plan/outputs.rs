@@ -151,7 +151,9 @@ fn map_output(config: &Config, infos: &[VolumeInfo], lowered: &Lowered, index: u
     let key = |k: &str| format!("{}.{k}", output.place.key);
     let stage_of = |name: &str| config.stages.iter().position(|s| s.name == name);
     let stage = stage_of(&output.from[0].name);
-    let Some((stage, &(source, first))) = stage.and_then(|s| lowered.maps.get(&s).map(|m| (s, m))) else { return Ok(None) };
+    let Some((stage, &(source, first))) = stage.and_then(|s| lowered.maps.get(&s).map(|m| (s, m))) else {
+        return Ok(None);
+    };
     if output.from.iter().any(|r| stage_of(&r.name) != Some(stage)) {
         return Err(Error::config(key("from"), "channels of an occlusion map share an output with each other only"));
     }

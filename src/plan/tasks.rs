@@ -121,7 +121,9 @@ impl OutputPlan {
         if !self.is_zarr() {
             return k == 0;
         }
-        let (Some(level), file, shape) = (self.level(k), self.commit_shape(), group.region.shape()) else { return false };
+        let (Some(level), file, shape) = (self.level(k), self.commit_shape(), group.region.shape()) else {
+            return false;
+        };
         k <= self.brick_level()
             && (0..3).all(|a| group.task[a] >= shape[a] || group.task[a] % (file[a] * level.factor[a]) == 0)
     }
@@ -130,7 +132,8 @@ impl OutputPlan {
     pub fn level_box(&self, k: usize, voxels: Region) -> Region {
         let level = self.level(k).expect("a level of the chain");
         let at = |v: i64, a: usize| (v - self.region.lo[a]).div_euclid(level.factor[a] as i64);
-        let up = |v: i64, a: usize| (v - self.region.lo[a] + level.factor[a] as i64 - 1).div_euclid(level.factor[a] as i64);
+        let up =
+            |v: i64, a: usize| (v - self.region.lo[a] + level.factor[a] as i64 - 1).div_euclid(level.factor[a] as i64);
         Region::new(
             std::array::from_fn(|a| at(voxels.lo[a], a)),
             std::array::from_fn(|a| up(voxels.hi[a], a).min(level.shape[a] as i64)),

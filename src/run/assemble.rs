@@ -147,7 +147,14 @@ impl Assembler<'_> {
     }
 
     /// Levels 1 to the last that bricks make; cells of that one are kept for the levels beyond.
-    fn levels(&self, place: &Place, src: Level0, brick: Region, scratch: &mut Scratch, items: &mut Vec<Item>) -> Result<()> {
+    fn levels(
+        &self,
+        place: &Place,
+        src: Level0,
+        brick: Region,
+        scratch: &mut Scratch,
+        items: &mut Vec<Item>,
+    ) -> Result<()> {
         let output = place.output;
         let mut cx = Context { level: self.level, scratch };
         let (mut cells, mut fine) = (Cells::default(), Cells::default());
@@ -185,13 +192,27 @@ impl Assembler<'_> {
     }
 
     /// Converts unrounded values to the output's type and puts them.
-    pub fn store_level(&self, place: &Place, k: usize, brick: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+    pub fn store_level(
+        &self,
+        place: &Place,
+        k: usize,
+        brick: Region,
+        view: AnyView,
+        items: &mut Vec<Item>,
+    ) -> Result<()> {
         let region = place.output.level_box(k, brick);
         self.store_box(place, k, region, view, items)
     }
 
     /// As [`Self::store_level`], for a box of the level's own cells.
-    pub fn store_box(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+    pub fn store_box(
+        &self,
+        place: &Place,
+        k: usize,
+        region: Region,
+        view: AnyView,
+        items: &mut Vec<Item>,
+    ) -> Result<()> {
         let spec = &place.output.spec;
         if view.dtype() == spec.dtype && place.target.range.is_none() {
             return self.put(place, k, region, view, items);

@@ -52,14 +52,7 @@ impl ChunkCache {
 
     /// One chunk for one brick: from the cache, or decoded once even if several ask. `uses` is how many bricks of the
     /// stream read this chunk.
-    pub fn get(
-        &self,
-        source: &Source,
-        key: Key,
-        uses: u32,
-        pool: &Pool,
-        metrics: &Metrics,
-    ) -> Result<Chunk> {
+    pub fn get(&self, source: &Source, key: Key, uses: u32, pool: &Pool, metrics: &Metrics) -> Result<Chunk> {
         let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
         loop {
             state.clock += 1;
@@ -171,7 +164,9 @@ impl Uses {
     }
 
     pub fn of(&self, chunk: [i64; 3]) -> u32 {
-        (0..3).map(|a| self.per_axis[a].get(chunk[a] as usize).copied().unwrap_or(1)).fold(1u32, |p, n| p.saturating_mul(n))
+        (0..3)
+            .map(|a| self.per_axis[a].get(chunk[a] as usize).copied().unwrap_or(1))
+            .fold(1u32, |p, n| p.saturating_mul(n))
     }
 
     /// Chunks that a box touches.

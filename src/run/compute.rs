@@ -89,8 +89,8 @@ pub fn evaluate(
             }
         }
     }
-    let plain_constant =
-        program.steps.is_empty() && program.sinks.iter().all(|&w| values[w].as_ref().is_some_and(|v| v.constants().is_some()));
+    let plain_constant = program.steps.is_empty()
+        && program.sinks.iter().all(|&w| values[w].as_ref().is_some_and(|v| v.constants().is_some()));
     match (ran, masked, constant || plain_constant) {
         (true, ..) => metrics.computed(),
         (false, true, _) => metrics.skipped("where"),

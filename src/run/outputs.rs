@@ -19,7 +19,10 @@ use crate::{Error, Result};
 pub enum Start {
     Afresh,
     /// Tasks that are done, and the pre-pass results found then.
-    Resume { done: Vec<usize>, globals: Vec<[f64; 2]> },
+    Resume {
+        done: Vec<usize>,
+        globals: Vec<[f64; 2]>,
+    },
     /// Every output is complete already.
     Complete,
 }
@@ -99,7 +102,9 @@ fn clear(config: &Config, output: &OutputPlan) -> Result<()> {
     match existing(&output.spec.path) {
         Existing::None => Ok(()),
         Existing::Ours { .. } => remove_ours(&output.spec.path),
-        Existing::Foreign => Err(refused(config, output, "was not written by this program, so --overwrite leaves it alone")),
+        Existing::Foreign => {
+            Err(refused(config, output, "was not written by this program, so --overwrite leaves it alone"))
+        }
     }
 }
 
@@ -131,7 +136,13 @@ pub fn range_of(output: &OutputPlan, globals: &[[f64; 2]]) -> Option<[f64; 2]> {
         Some(id) => {
             let [lo, hi] = Plan::global(globals, id);
             let usable = lo.is_finite() && hi.is_finite();
-            Some(if !usable { [0.0, 1.0] } else if hi > lo { [lo, hi] } else { [lo, lo + 1.0] })
+            Some(if !usable {
+                [0.0, 1.0]
+            } else if hi > lo {
+                [lo, hi]
+            } else {
+                [lo, lo + 1.0]
+            })
         }
         None => output.range,
     }

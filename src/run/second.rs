@@ -10,11 +10,11 @@ use super::maps::dense;
 use crate::Result;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{AnyView, Region, View};
+use crate::kernel::Context;
 use crate::kernel::convert::{Mapping, convert_at};
 use crate::kernel::occlusion_map::{Moments, coarsen, needed};
 use crate::kernel::reduce::{Cells, planes};
 use crate::kernel::simd::Level;
-use crate::kernel::Context;
 use crate::plan::OutputPlan;
 use crate::store::Spill;
 
@@ -92,7 +92,14 @@ fn read_plane(spill: &Spill, plane: usize, region: Region) -> Vec<f64> {
 }
 
 /// One chunk, all components, of reduced cells.
-fn cells_chunk(output: &OutputPlan, target: &Target, fine: &Spill, next: &Spill, k: usize, region: Region) -> Result<u64> {
+fn cells_chunk(
+    output: &OutputPlan,
+    target: &Target,
+    fine: &Spill,
+    next: &Spill,
+    k: usize,
+    region: Region,
+) -> Result<u64> {
     let (layout, below) = (output.level(k).expect("level exists"), output.level(k - 1).expect("level exists"));
     let step: [i64; 3] = layout.halved.map(|h| 1 + i64::from(h));
     let scaled = |v: [i64; 3]| std::array::from_fn(|a| v[a] * step[a]);
@@ -123,7 +130,14 @@ fn cells_chunk(output: &OutputPlan, target: &Target, fine: &Spill, next: &Spill,
 }
 
 /// One chunk of an occlusion map's chain.
-fn map_chunk(output: &OutputPlan, target: &Target, fine: &Spill, next: &Spill, k: usize, region: Region) -> Result<u64> {
+fn map_chunk(
+    output: &OutputPlan,
+    target: &Target,
+    fine: &Spill,
+    next: &Spill,
+    k: usize,
+    region: Region,
+) -> Result<u64> {
     let map = output.map.as_ref().expect("the caller saw a map");
     let (layout, below) = (&map.chain.levels[k], &map.chain.levels[k - 1]);
     let from = needed(region, layout.halved, below.shape);
@@ -150,7 +164,14 @@ fn mapping(output: &OutputPlan, target: &Target) -> Mapping {
     Mapping { range: target.range, fill: output.spec.fill }
 }
 
-fn store(output: &OutputPlan, target: &Target, k: usize, component: usize, region: Region, voxels: &Voxels) -> Result<u64> {
+fn store(
+    output: &OutputPlan,
+    target: &Target,
+    k: usize,
+    component: usize,
+    region: Region,
+    voxels: &Voxels,
+) -> Result<u64> {
     let dataset = k - output.first_level();
     let chunk = target.sink.encode(dataset, region, voxels.view(region.shape()))?;
     target.sink.put(dataset, component, region, chunk)

@@ -17,10 +17,10 @@ use super::prepass::MinMax;
 use super::program::Program;
 use super::read::Reader;
 use super::report::{Report, StageReport};
+use super::second;
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
-use super::second;
 use crate::brick::{Pool, Scratch};
 use crate::config::{Config, config_hash};
 use crate::grid::{Region, order::morton};
@@ -214,13 +214,8 @@ impl<'a> Session<'a> {
             slots.push(TaskSlot::new(task, region, bricks.len()));
             work.extend(bricks.into_iter().map(|brick| Work { brick, slot: slots.len() - 1 }));
         }
-        let assembler = Assembler {
-            plan: &self.plan,
-            group,
-            targets: &self.targets,
-            pool: &self.pool,
-            level: engine.level,
-        };
+        let assembler =
+            Assembler { plan: &self.plan, group, targets: &self.targets, pool: &self.pool, level: engine.level };
         let deliver =
             |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
         let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items);

@@ -11,7 +11,9 @@ use crate::kernel::simd::Level;
 use crate::kernel::window::WindowOut;
 use crate::kernel::{Context, gaussian, gradient, mask, pointwise, rank, window};
 use crate::plan::Plan;
-use crate::plan::graph::{GradientChannel, Mask, Moment, ObscuranceChannel, Step, StepId, StepKind, TransferChannel, Wire};
+use crate::plan::graph::{
+    GradientChannel, Mask, Moment, ObscuranceChannel, Step, StepId, StepKind, TransferChannel, Wire,
+};
 use crate::stage::WindowParams;
 
 /// What all bricks of a run share.
@@ -158,7 +160,14 @@ impl<'a> Engine<'a> {
         Some(outputs.into_iter().map(spread).collect())
     }
 
-    fn compute(&self, id: StepId, inputs: &[&Value], region: Region, volume: Region, scratch: &mut Scratch) -> Vec<Value> {
+    fn compute(
+        &self,
+        id: StepId,
+        inputs: &[&Value],
+        region: Region,
+        volume: Region,
+        scratch: &mut Scratch,
+    ) -> Vec<Value> {
         let step = &self.plan.graph.steps[id];
         let wires: Vec<&Wire> = step.outputs.iter().map(|&w| &self.plan.graph.wires[w]).collect();
         let mut outputs: Vec<Value> = wires
@@ -173,7 +182,17 @@ impl<'a> Engine<'a> {
         match &step.kind {
             StepKind::Obscurance { channels, colour, normal, .. } => {
                 let sweep = &self.sweeps[&id];
-                self.sweep(sweep, channels, colour.is_some(), normal.is_some(), inputs, &mut outputs, region, volume, &mut cx);
+                self.sweep(
+                    sweep,
+                    channels,
+                    colour.is_some(),
+                    normal.is_some(),
+                    inputs,
+                    &mut outputs,
+                    region,
+                    volume,
+                    &mut cx,
+                );
             }
             StepKind::Gradient { size, weight, spacing, channels } => {
                 let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
@@ -349,7 +368,15 @@ impl<'a> Engine<'a> {
             let mut floats = self.pool.take(dtype, value.region.voxels());
             pointwise::scale(src, Affine::IDENTITY, wire.missing, floats.view_mut(value.region.shape()));
             padded = self.pool.take(dtype, wanted.voxels());
-            extend_any(floats.view(value.region.shape()), value.region, &mut padded, wanted, volume, step.border, outside);
+            extend_any(
+                floats.view(value.region.shape()),
+                value.region,
+                &mut padded,
+                wanted,
+                volume,
+                step.border,
+                outside,
+            );
             self.pool.put(floats);
         } else {
             padded = self.pool.take(dtype, wanted.voxels());
@@ -392,7 +419,15 @@ fn inputs_of<'v>(step: &Step, values: &'v [Option<Value>]) -> Vec<&'v Value> {
     step.inputs.iter().map(|&w| values[w].as_ref().expect("inputs are made before their readers")).collect()
 }
 
-fn extend_any(src: AnyView, src_box: Region, dst: &mut Voxels, dst_box: Region, volume: Region, border: Border, outside: f64) {
+fn extend_any(
+    src: AnyView,
+    src_box: Region,
+    dst: &mut Voxels,
+    dst_box: Region,
+    volume: Region,
+    border: Border,
+    outside: f64,
+) {
     macro_rules! arms {
         ($($t:ident: $ty:ty),*) => {
             match (src, dst.view_mut(dst_box.shape())) {
@@ -421,7 +456,14 @@ fn fill_where(comp: &mut Comp, needed: &[u8], fill: f64) {
 }
 
 /// Integer outputs (min, max) of a missing voxel hold the missing value, so that later stages see it as missing.
-fn repair_missing(wires: &[&Wire], input: &Value, comp: usize, input_wire: &Wire, outputs: &mut [Value], region: Region) {
+fn repair_missing(
+    wires: &[&Wire],
+    input: &Value,
+    comp: usize,
+    input_wire: &Wire,
+    outputs: &mut [Value],
+    region: Region,
+) {
     let Some(missing) = input_wire.missing else { return };
     for (wire, value) in wires.iter().zip(outputs) {
         if wire.dtype.is_float() || wire.missing.is_none() {

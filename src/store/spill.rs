@@ -72,7 +72,11 @@ impl Spill {
     }
 
     fn rows(&self, plane: usize, region: Region) -> impl Iterator<Item = usize> + use<> {
-        assert!(plane < self.planes && Region::whole(self.shape).contains(&region), "{region:?} outside {:?}", self.shape);
+        assert!(
+            plane < self.planes && Region::whole(self.shape).contains(&region),
+            "{region:?} outside {:?}",
+            self.shape
+        );
         let ([nz, ny, nx], item) = (self.shape, self.item);
         let lines = Region::new(region.lo, [region.hi[0], region.hi[1], region.lo[2] + 1]);
         lines.iter().map(move |[z, y, x]| (((plane * nz + z as usize) * ny + y as usize) * nx + x as usize) * item)
