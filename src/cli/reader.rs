@@ -110,7 +110,14 @@ impl Volume {
 
 /// [`input`] of a path with what is known beside it.
 pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attributes) -> Result<Input> {
-    input(path, level, &describe(path, raw, attributes))
+    let raw = describe(path, raw, attributes);
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let stem = name.strip_suffix(".gz").unwrap_or(&name);
+    if raw.shape.is_none() && path.is_file() && (stem.ends_with(".raw") || stem.ends_with(".bin")) {
+        let message = format!("{} is headerless; expected --shape Z,Y,X and --dtype beside it", path.display());
+        return Err(usage("--shape", message));
+    }
+    input(path, level, &raw)
 }
 
 /// A headerless output of this program: shape and type stand in the file beside it.
