@@ -1,8 +1,31 @@
 //! Box-window statistics and the openness estimators made from them (papers A and E), fused in one pass.
+//!
+//! Tiles as wide as possible in x go through z, then y, then x ([`plan`]); the raw planes are the ring, so nothing but
+//! a batch of reduced planes is kept, and the estimators consume rows while they are in L1.
+//! Integers use exact sums ([`int`]), floats sums and (mean, M2) merges in f64 along a tree that depends on the window
+//! alone ([`float`]). [`reference`] says in a page what must come out.
 
 use super::Context;
-use crate::grid::{AnyView, AnyViewMut, DType, Shape};
+use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{WindowChannel, WindowParams};
+
+mod emit;
+mod estimate;
+mod float;
+mod float_estimate;
+mod int;
+mod lines;
+mod math;
+mod merge;
+mod plan;
+#[doc(hidden)]
+pub mod reference;
+#[cfg(test)]
+mod tests;
+
+use emit::Emit;
+use int::Dispatch;
+use plan::{Job, Needs, Plain};
 
 /// One requested result. Its element type must be: for `Min` and `Max` the input's type where the affine is the identity,
 /// else `src.dtype().result()`; for everything else `src.dtype().result()`. An `Openness` may also ask for `u8` where
@@ -13,14 +36,104 @@ pub struct WindowOut<'a> {
 }
 
 /// Computes every channel of `outs` for the box that starts at voxel `at` of `src`; all outputs have the same shape.
-/// Panics if extents or types disagree.
+///
+/// Missing voxels (NaN, or `params.missing` for integers) do not count. Where the centre is missing, float outputs are
+/// NaN and integer outputs 0. An infinity changes only the windows that hold it: minimum, maximum and mean follow IEEE,
+/// variance and std are NaN, the second moment is +inf. Openness with infinities in a window that is not constant: 1 at
+/// a centre of +inf, 0 at -inf; at a finite centre the limit of `cdf_power` (0 with +inf, 1 with -inf in the window),
+/// and for the methods that use the spread an infinitely distant mean (`gaussian_cdf` and `chebyshev` 0 with +inf and 1
+/// with -inf, `chebyshev_literal` the reverse); NaN where both infinities meet. `solid_low` swaps the signs.
+///
+/// Panics if extents or types disagree, or if a window could hold 2^31 voxels.
 pub fn window(src: AnyView, params: &WindowParams, at: [usize; 3], outs: &mut [WindowOut], cx: &mut Context) {
-    let _ = (src, params, at, outs, cx);
-    todo!()
+    let Some(dst) = outs.first().map(|o| o.dst.shape()) else { return };
+    check(src, params, at, dst, outs);
+    if dst.contains(&0) {
+        return;
+    }
+    match src {
+        AnyView::U8(v) => integers::<u8, u8>(v, 0, params, at, dst, outs, cx),
+        AnyView::I8(v) => integers::<i8, u8>(v, 1 << 7, params, at, dst, outs, cx),
+        AnyView::U16(v) => integers::<u16, u16>(v, 0, params, at, dst, outs, cx),
+        AnyView::I16(v) => integers::<i16, u16>(v, 1 << 15, params, at, dst, outs, cx),
+        AnyView::U32(v) => integers::<u32, u32>(v, 0, params, at, dst, outs, cx),
+        AnyView::I32(v) => integers::<i32, u32>(v, 1 << 31, params, at, dst, outs, cx),
+        AnyView::F32(v) => float::run(v, params, at, dst, outs, cx),
+        AnyView::F64(v) => float::run(v, params, at, dst, outs, cx),
+    }
 }
 
 /// Bytes of scratch that [`window`] takes at most.
 pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams, channels: &[WindowChannel]) -> usize {
-    let _ = (dtype, src, dst, params, channels);
-    todo!()
+    if dst.contains(&0) || channels.is_empty() {
+        return 0;
+    }
+    let needs = Needs::of(channels.iter().copied(), dtype.is_float());
+    // No layout depends on where the box lies.
+    let job = Job::new(src, dst, [0; 3], params, needs, plan::batch_bytes(dtype, needs));
+    let masked = params.missing.is_some();
+    match dtype {
+        DType::U8 | DType::I8 => int_bytes::<u8>(&job, masked),
+        DType::U16 | DType::I16 => int_bytes::<u16>(&job, masked),
+        DType::U32 | DType::I32 => int_bytes::<u32>(&job, masked),
+        DType::F32 => float::bytes::<f32>(&job),
+        DType::F64 => float::bytes::<f64>(&job),
+    }
+}
+
+fn int_bytes<C: Dispatch>(job: &Job, masked: bool) -> usize {
+    Emit::bytes(job.tile[1]) + C::bytes(job, masked)
+}
+
+fn check(src: AnyView, params: &WindowParams, at: [usize; 3], dst: Shape, outs: &[WindowOut]) {
+    let shape = src.shape();
+    assert!((0..3).all(|a| at[a] + dst[a] <= shape[a]), "output {dst:?} at {at:?} sticks out of {shape:?}");
+    for out in outs {
+        assert_eq!(out.dst.shape(), dst, "outputs of one shape");
+        let (dtype, given) = (src.dtype(), out.dst.dtype());
+        let fits = match out.channel {
+            WindowChannel::Min | WindowChannel::Max if params.affine.is_identity() => given == dtype,
+            WindowChannel::Openness(..) => {
+                given == dtype.result() || given == DType::U8 && dtype.result() == DType::F32
+            }
+            _ => given == dtype.result(),
+        };
+        assert!(fits, "{:?} of {dtype} is not written as {given}", out.channel);
+    }
+}
+
+/// Integer volumes of type `S` as unsigned codes `C`: stored bits XOR `flip`.
+fn integers<S: Voxel, C: Dispatch>(
+    src: View<S>,
+    flip: C,
+    params: &WindowParams,
+    at: [usize; 3],
+    dst: Shape,
+    outs: &mut [WindowOut],
+    cx: &mut Context,
+) {
+    let needs = Needs::of(outs.iter().map(|o| o.channel), false);
+    let job = Job::new(src.shape, dst, at, params, needs, plan::batch_bytes(S::DTYPE, needs));
+    // A marker that the type cannot hold marks nothing.
+    let missing = params.missing.map(|m| m as f64).filter(|m| {
+        let (least, most) = S::DTYPE.range();
+        (least..=most).contains(m)
+    });
+    let missing = missing.map(|m| code_of::<C>(m + flip.u32() as f64));
+    let mut bytes = cx.scratch.take(Emit::bytes(job.tile[1]) + C::bytes(&job, missing.is_some()));
+    let mut emit = Emit::new(outs, params, cx.level, job.tile[1], &mut bytes);
+    let setup = int::Setup { job: &job, level: cx.level, flip, missing };
+    let view = View { data: bits::<C, S>(src.data), shape: src.shape, plane: src.plane, row: src.row };
+    C::run(view, &setup, &mut emit, bytes);
+}
+
+fn code_of<C: Dispatch>(code: f64) -> C {
+    C::from_f64(code)
+}
+
+/// The same numbers as another type of the same size.
+fn bits<T: Plain, U: Voxel>(data: &[U]) -> &[T] {
+    assert_eq!(size_of::<T>(), size_of::<U>(), "types of one size");
+    // SAFETY: equal size (asserted) and alignment (primitive numbers), and every bit pattern is a value of both.
+    unsafe { std::slice::from_raw_parts(data.as_ptr().cast(), data.len()) }
 }

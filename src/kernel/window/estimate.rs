@@ -1,0 +1,375 @@
+//! From exact integer sums of one row of windows to results. Codes are unsigned: a stored value is `code - offset`.
+
+use super::lines::Elem;
+use super::math;
+
+/// Integer that sums are kept in; arithmetic wraps, and the caller proves that final values fit.
+pub trait Acc: Copy + Default + PartialOrd + std::fmt::Debug + 'static {
+    fn plus(self, o: Self) -> Self;
+    fn minus(self, o: Self) -> Self;
+    fn wide(self) -> u128;
+    fn low(self) -> u64;
+}
+
+macro_rules! acc {
+    ($($t:ident)*) => {$(
+        impl Acc for $t {
+            #[inline(always)]
+            fn plus(self, o: $t) -> $t { self.wrapping_add(o) }
+            #[inline(always)]
+            fn minus(self, o: $t) -> $t { self.wrapping_sub(o) }
+            #[inline(always)]
+            fn wide(self) -> u128 { self as u128 }
+            #[inline(always)]
+            fn low(self) -> u64 { self as u64 }
+        }
+    )*};
+}
+acc!(u16 u32 u64 u128);
+
+/// The integer that first sums of a row end in: u32 or u64.
+pub trait RowSum: Acc {
+    /// `n * code`, which fits where the sum of a window fits.
+    fn times(n: u32, code: u32) -> Self;
+    /// Rounded once.
+    fn f32(self) -> f32;
+}
+impl RowSum for u32 {
+    #[inline(always)]
+    fn times(n: u32, code: u32) -> u32 {
+        n.wrapping_mul(code)
+    }
+    #[inline(always)]
+    fn f32(self) -> f32 {
+        self as f32
+    }
+}
+impl RowSum for u64 {
+    #[inline(always)]
+    fn times(n: u32, code: u32) -> u64 {
+        n as u64 * code as u64
+    }
+    #[inline(always)]
+    fn f32(self) -> f32 {
+        self as f32
+    }
+}
+
+/// Unsigned codes of integer voxels.
+pub trait Code: Elem {
+    type Square: Copy;
+    /// Largest code.
+    const TOP: u32;
+    fn u32(self) -> u32;
+    /// Exact: u8 in u16, u16 in u32, u32 in u64.
+    fn square(self) -> Self::Square;
+    /// `self - other >= 0`, rounded once.
+    fn above(self, other: Self) -> f32;
+}
+impl Code for u8 {
+    type Square = u16;
+    const TOP: u32 = u8::MAX as u32;
+    #[inline(always)]
+    fn u32(self) -> u32 {
+        self as u32
+    }
+    #[inline(always)]
+    fn square(self) -> u16 {
+        self as u16 * self as u16
+    }
+    #[inline(always)]
+    fn above(self, other: u8) -> f32 {
+        (self as i32 - other as i32) as f32
+    }
+}
+impl Code for u16 {
+    type Square = u32;
+    const TOP: u32 = u16::MAX as u32;
+    #[inline(always)]
+    fn u32(self) -> u32 {
+        self as u32
+    }
+    #[inline(always)]
+    fn square(self) -> u32 {
+        self as u32 * self as u32
+    }
+    #[inline(always)]
+    fn above(self, other: u16) -> f32 {
+        (self as i32 - other as i32) as f32
+    }
+}
+impl Code for u32 {
+    type Square = u64;
+    const TOP: u32 = u32::MAX;
+    #[inline(always)]
+    fn u32(self) -> u32 {
+        self
+    }
+    #[inline(always)]
+    fn square(self) -> u64 {
+        self as u64 * self as u64
+    }
+    #[inline(always)]
+    fn above(self, other: u32) -> f32 {
+        self.wrapping_sub(other) as f32
+    }
+}
+
+/// Exact for values below 2^52, in two operations on any vector unit.
+#[inline(always)]
+fn small(v: u64) -> f64 {
+    f64::from_bits(v | 0x4330_0000_0000_0000) - 4_503_599_627_370_496.0
+}
+
+/// How the numerator n S2 - S1^2 = n^2 variance is made exact.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Width {
+    /// S1, S2 < 2^52: `S1^2 = p + e` by a fused product, `(n S2 - p) - e`. Below 2^53 every step is exact (all are
+    /// integers); above, e is 2^-53 of p at most and the result is off by 1.5 * 2^-53 of itself at most.
+    Direct,
+    /// The same on codes less 32768, whose squares are four times smaller (16-bit types).
+    Centred,
+    /// u128.
+    Big,
+}
+
+impl Width {
+    /// For windows of at most `n` voxels of codes up to `top`.
+    pub fn of(n: u64, top: u32) -> Width {
+        let limit = 1u128 << 52;
+        if n as u128 * (top as u128).pow(2) < limit {
+            Width::Direct
+        } else if top == u16::MAX as u32 && (n as u128) << 30 < limit {
+            Width::Centred
+        } else {
+            Width::Big
+        }
+    }
+}
+
+crate::multiversion! {
+    /// `out = n S2 - S1^2` of each window, exactly zero only for equal values.
+    pub fn numerator_row[X1: RowSum, X2: Acc](s1: &[X1], s2: &[X2], n: &[u32], width: Width, out: &mut [f64]) -> () = numerator_inner;
+}
+
+#[inline(always)]
+fn numerator_inner<X1: RowSum, X2: Acc>(s1: &[X1], s2: &[X2], n: &[u32], width: Width, out: &mut [f64]) {
+    let len = out.len();
+    let (s1, s2, n) = (&s1[..len], &s2[..len], &n[..len]);
+    let fused = |n: f64, s1: f64, s2: f64| {
+        let p = s1 * s1;
+        let e = s1.mul_add(s1, -p);
+        n.mul_add(s2, -p) - e
+    };
+    match width {
+        Width::Direct => {
+            for i in 0..len {
+                out[i] = fused(n[i] as f64, small(s1[i].low()), small(s2[i].low()));
+            }
+        }
+        Width::Centred => {
+            for i in 0..len {
+                let (a, m) = (s1[i].low(), n[i] as u64);
+                let centred = s2[i].low().wrapping_sub(a << 16).wrapping_add(m << 30);
+                let m = m as f64;
+                out[i] = fused(m, (-32768f64).mul_add(m, small(a)), small(centred));
+            }
+        }
+        Width::Big => {
+            for i in 0..len {
+                let (a, m) = (s1[i].wide(), n[i] as u128);
+                out[i] = m.wrapping_mul(s2[i].wide()).wrapping_sub(a * a) as f64;
+            }
+        }
+    }
+}
+
+crate::multiversion! {
+    /// Mean of the stored values (`code - offset`), f64; `exact` says that S1 < 2^52.
+    pub fn mean_row[X1: RowSum](s1: &[X1], n: &[u32], offset: f64, exact: bool, out: &mut [f64]) -> () = mean_inner;
+}
+
+#[inline(always)]
+fn mean_inner<X1: RowSum>(s1: &[X1], n: &[u32], offset: f64, exact: bool, out: &mut [f64]) {
+    let len = out.len();
+    let (s1, n) = (&s1[..len], &n[..len]);
+    if exact {
+        for i in 0..len {
+            let m = n[i] as f64;
+            out[i] = (-offset).mul_add(m, small(s1[i].low())) / m; // the numerator is an integer below 2^53: exact
+        }
+    } else {
+        for i in 0..len {
+            // Quotient and remainder: only the sum rounds, the fraction's own rounding lies 2^-53 below it.
+            let (s, m) = (s1[i].low(), n[i].max(1) as u64);
+            out[i] = ((s / m) as f64 - offset) + (s % m) as f64 / m as f64;
+        }
+    }
+}
+
+/// What the estimators of openness share.
+#[derive(Debug, Clone, Copy)]
+pub struct Polarity {
+    /// The method is applied to -v.
+    pub flipped: bool,
+    /// Openness of a window of equal values.
+    pub constant: f32,
+}
+
+crate::multiversion! {
+    /// A 3.2: `t^beta`, from codes of the centre `v` (before `flip`), extremes and sums.
+    pub fn cdf_power_row[T: Code, X1: RowSum](
+        v: &[T], flip: T, lo: &[T], hi: &[T], s1: &[X1], n: &[u32], polarity: Polarity, out: &mut [f32]
+    ) -> () = cdf_power_inner;
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn cdf_power_inner<T: Code, X1: RowSum>(
+    v: &[T],
+    flip: T,
+    lo: &[T],
+    hi: &[T],
+    s1: &[X1],
+    n: &[u32],
+    polarity: Polarity,
+    out: &mut [f32],
+) {
+    if polarity.flipped {
+        cdf_power_as::<T, X1, true>(v, flip, lo, hi, s1, n, polarity.constant, out);
+    } else {
+        cdf_power_as::<T, X1, false>(v, flip, lo, hi, s1, n, polarity.constant, out);
+    }
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn cdf_power_as<T: Code, X1: RowSum, const FLIPPED: bool>(
+    v: &[T],
+    flip: T,
+    lo: &[T],
+    hi: &[T],
+    s1: &[X1],
+    n: &[u32],
+    constant: f32,
+    out: &mut [f32],
+) {
+    let len = out.len();
+    let (v, lo, hi, s1, n) = (&v[..len], &lo[..len], &hi[..len], &s1[..len], &n[..len]);
+    for i in 0..len {
+        let c = v[i].code(flip);
+        let below = c.above(lo[i]);
+        let above = hi[i].above(c);
+        let range = hi[i].above(lo[i]);
+        // Sums of (v_i - min) and (max - v_i): exact, so beta keeps its relative accuracy whatever its size.
+        let over = s1[i].minus(X1::times(n[i], lo[i].u32())).f32();
+        let under = X1::times(n[i], hi[i].u32()).minus(s1[i]).f32();
+        let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
+        let beta = p / q;
+        let beta = if beta > 1e-6 { beta } else { 1e-6 };
+        let beta = if beta < 1e6 { beta } else { 1e6 };
+        let y = math::power(a, b, range, beta);
+        let y = if a == 0.0 { 0.0 } else { y };
+        let y = if b == 0.0 { 1.0 } else { y };
+        out[i] = if range == 0.0 { constant } else { y };
+    }
+}
+
+/// Estimators that use the mean and the variance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Spread {
+    Gaussian,
+    Chebyshev,
+    Literal,
+}
+
+/// Openness from `d = n (v - mean)` and `m = n^2 variance > 0`, both rounded to f32 from exact values.
+#[inline(always)]
+pub fn spread(kind: Spread, d: f32, m: f32) -> f32 {
+    match kind {
+        Spread::Gaussian => math::phi(d / m.sqrt()),
+        // 1 - m / (m + d^2) without the cancellation
+        Spread::Chebyshev => {
+            if d <= 0.0 {
+                0.0
+            } else {
+                d * d / d.mul_add(d, m)
+            }
+        }
+        Spread::Literal => {
+            if d <= 0.0 {
+                1.0
+            } else {
+                m / d.mul_add(d, m)
+            }
+        }
+    }
+}
+
+crate::multiversion! {
+    /// A 3.3 and E 3.4 from codes of the centre, S1 and the numerator row.
+    pub fn spread_row[T: Code, X1: RowSum](
+        kind: Spread, v: &[T], flip: T, s1: &[X1], n: &[u32], numerator: &[f64], polarity: Polarity, out: &mut [f32]
+    ) -> () = spread_inner;
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn spread_inner<T: Code, X1: RowSum>(
+    kind: Spread,
+    v: &[T],
+    flip: T,
+    s1: &[X1],
+    n: &[u32],
+    numerator: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) {
+    let len = out.len();
+    let (v, s1, n, numerator) = (&v[..len], &s1[..len], &n[..len], &numerator[..len]);
+    let sign = if polarity.flipped { -1.0 } else { 1.0 };
+    macro_rules! row {
+        ($kind:expr) => {
+            for i in 0..len {
+                let c = v[i].code(flip).u32();
+                let d = if T::TOP <= u16::MAX as u32 {
+                    (n[i] as f64).mul_add(c as f64, -small(s1[i].low())) as f32 // n < 2^31: exact before the cast
+                } else {
+                    (n[i] as u64 * c as u64).wrapping_sub(s1[i].low()) as i64 as f32
+                };
+                let y = spread($kind, sign * d, numerator[i] as f32);
+                out[i] = if numerator[i] == 0.0 { polarity.constant } else { y };
+            }
+        };
+    }
+    match kind {
+        Spread::Gaussian => row!(Spread::Gaussian),
+        Spread::Chebyshev => row!(Spread::Chebyshev),
+        Spread::Literal => row!(Spread::Literal),
+    }
+}
+
+crate::multiversion! {
+    /// [`math::quantise`] of a row.
+    pub fn quantise_row[](openness: &[f32], out: &mut [u8]) -> () = quantise_inner;
+}
+
+#[inline(always)]
+fn quantise_inner(openness: &[f32], out: &mut [u8]) {
+    for (o, v) in out.iter_mut().zip(openness) {
+        *o = math::quantise(*v);
+    }
+}
+
+crate::multiversion! {
+    /// Variance from its numerator.
+    pub fn variance_row[](numerator: &[f64], n: &[u32], out: &mut [f64]) -> () = variance_inner;
+}
+
+#[inline(always)]
+fn variance_inner(numerator: &[f64], n: &[u32], out: &mut [f64]) {
+    for ((o, m), n) in out.iter_mut().zip(numerator).zip(n) {
+        let n = *n as f64;
+        *o = m / (n * n);
+    }
+}

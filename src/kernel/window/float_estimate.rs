@@ -1,0 +1,270 @@
+//! From moments of one row of float windows to results.
+
+use super::estimate::{Polarity, Spread};
+use super::math;
+use super::merge::{Pair, Sum};
+use crate::grid::{Affine, Voxel};
+use crate::kernel::simd::Level;
+
+crate::multiversion! {
+    pub fn mean_row[A: Sum](s: &[A], n: &[f64], out: &mut [f64]) -> () = mean_inner;
+}
+
+#[inline(always)]
+fn mean_inner<A: Sum>(s: &[A], n: &[f64], out: &mut [f64]) {
+    for ((o, s), n) in out.iter_mut().zip(s).zip(n) {
+        *o = s.over(*n);
+    }
+}
+
+crate::multiversion! {
+    pub fn variance_row[](m: &[f64], n: &[f64], out: &mut [f64]) -> () = variance_inner;
+}
+
+#[inline(always)]
+fn variance_inner(m: &[f64], n: &[f64], out: &mut [f64]) {
+    for ((o, m), n) in out.iter_mut().zip(m).zip(n) {
+        *o = m / n;
+    }
+}
+
+crate::multiversion! {
+    /// Extremes, scaled; zeros lose their sign, which would depend on the order of comparisons.
+    pub fn extreme_row[T: Voxel](from: &[T], affine: Affine, out: &mut [T]) -> () = extreme_inner;
+}
+
+#[inline(always)]
+fn extreme_inner<T: Voxel>(from: &[T], affine: Affine, out: &mut [T]) {
+    for (o, v) in out.iter_mut().zip(from) {
+        *o = T::from_f64(affine.slope * v.to_f64() + affine.intercept); // with the identity exact: v + 0
+    }
+}
+
+/// Float voxels at the centre of a window.
+pub trait Centre: Voxel {
+    type Total: Sum;
+    /// A 3.2 for a row.
+    #[allow(clippy::too_many_arguments)]
+    fn cdf_power(
+        level: Level,
+        v: &[Self],
+        lo: &[Self],
+        hi: &[Self],
+        s: &[Self::Total],
+        n: &[f64],
+        polarity: Polarity,
+        out: &mut [f32],
+    );
+}
+
+impl Centre for f32 {
+    type Total = f64;
+    fn cdf_power(
+        level: Level,
+        v: &[f32],
+        lo: &[f32],
+        hi: &[f32],
+        s: &[f64],
+        n: &[f64],
+        polarity: Polarity,
+        out: &mut [f32],
+    ) {
+        if power_row(level, v, lo, hi, s, n, polarity, out) {
+            for i in 0..out.len() {
+                if !tame(v[i] - lo[i], hi[i] - v[i], hi[i] - lo[i]) {
+                    out[i] = power_voxel(v[i], lo[i], hi[i], s[i], n[i], polarity);
+                }
+            }
+        }
+    }
+}
+
+impl Centre for f64 {
+    type Total = Pair;
+    fn cdf_power(
+        _: Level,
+        v: &[f64],
+        lo: &[f64],
+        hi: &[f64],
+        s: &[Pair],
+        n: &[f64],
+        polarity: Polarity,
+        out: &mut [f32],
+    ) {
+        for (i, o) in out.iter_mut().enumerate() {
+            *o = power_voxel(v[i], lo[i], hi[i], s[i], n[i], polarity);
+        }
+    }
+}
+
+/// Whether f32 holds every quotient that the fast form takes: the range and n times it neither overflow nor vanish, and
+/// neither share of it underflows.
+#[inline(always)]
+fn tame(below: f32, above: f32, range: f32) -> bool {
+    const SMALL: f32 = 8.077_936e-28; // 2^-90
+    const LARGE: f32 = 1.237_940_1e27; // 2^90
+    let least = range * SMALL;
+    let shares = (below >= least || below == 0.0) & (above >= least || above == 0.0);
+    ((range > SMALL) & (range < LARGE) & shares) | (range == 0.0)
+}
+
+crate::multiversion! {
+    /// `t^beta` in f32 from exactly rounded differences; returns whether some voxel needs [`power_voxel`].
+    fn power_row[](
+        v: &[f32], lo: &[f32], hi: &[f32], s: &[f64], n: &[f64], polarity: Polarity, out: &mut [f32]
+    ) -> bool = power_row_inner;
+}
+
+#[inline(always)]
+fn power_row_inner(
+    v: &[f32],
+    lo: &[f32],
+    hi: &[f32],
+    s: &[f64],
+    n: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) -> bool {
+    if polarity.flipped {
+        power_row_as::<true>(v, lo, hi, s, n, polarity.constant, out)
+    } else {
+        power_row_as::<false>(v, lo, hi, s, n, polarity.constant, out)
+    }
+}
+
+#[inline(always)]
+fn power_row_as<const FLIPPED: bool>(
+    v: &[f32],
+    lo: &[f32],
+    hi: &[f32],
+    s: &[f64],
+    n: &[f64],
+    constant: f32,
+    out: &mut [f32],
+) -> bool {
+    let len = out.len();
+    let (v, lo, hi, s, n) = (&v[..len], &lo[..len], &hi[..len], &s[..len], &n[..len]);
+    let mut wild = 0u32;
+    for i in 0..len {
+        let (below, above, range) = (v[i] - lo[i], hi[i] - v[i], hi[i] - lo[i]);
+        wild |= !tame(below, above, range) as u32;
+        // Both lie in range..n range, and the sum is right to 2^-53 of itself or exact where that matters.
+        let over = (-n[i]).mul_add(lo[i] as f64, s[i]) as f32;
+        let under = n[i].mul_add(hi[i] as f64, -s[i]) as f32;
+        let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
+        let beta = p / q;
+        let beta = if beta > 1e-6 { beta } else { 1e-6 };
+        let beta = if beta < 1e6 { beta } else { 1e6 };
+        let y = math::power(a, b, range, beta);
+        let y = if a == 0.0 { 0.0 } else { y };
+        let y = if b == 0.0 { 1.0 } else { y };
+        out[i] = if range == 0.0 { constant } else { y };
+    }
+    wild != 0
+}
+
+/// `t^beta` of any finite or infinite window, in f64.
+fn power_voxel<T: Voxel, A: Sum>(v: T, lo: T, hi: T, s: A, n: f64, polarity: Polarity) -> f32 {
+    let (v, lo, hi) = (v.to_f64(), lo.to_f64(), hi.to_f64());
+    if lo == hi {
+        return polarity.constant;
+    }
+    if !lo.is_finite() || !hi.is_finite() {
+        return infinite(v, lo, hi, polarity.flipped, 0.0);
+    }
+    // Halves: the range of f64 values may exceed the largest of them.
+    let (below, above, range) = (0.5 * v - 0.5 * lo, 0.5 * hi - 0.5 * v, 0.5 * hi - 0.5 * lo);
+    let (over, under) = (s.less(n, lo), -s.less(n, hi));
+    let (a, b, p, q) = if polarity.flipped { (above, below, under, over) } else { (below, above, over, under) };
+    if a == 0.0 || b == 0.0 {
+        return if b == 0.0 { 1.0 } else { 0.0 };
+    }
+    let beta = (p / q).clamp(1e-6, 1e6);
+    let log =
+        if 3.0 * b < range { math::log2_1p((-b / range) as f32) as f64 } else { math::log2(a) - math::log2(range) };
+    math::exp2((beta * log) as f32)
+}
+
+/// Openness of a window that holds an infinity and is not constant: 1 at +inf, 0 at -inf; else `above` where there is
+/// only +inf, `1 - above` where there is only -inf, NaN where both meet.
+fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, above: f32) -> f32 {
+    let (v, lo, hi) = if flipped { (-v, -hi, -lo) } else { (v, lo, hi) };
+    if v == f64::INFINITY {
+        1.0
+    } else if v == f64::NEG_INFINITY {
+        0.0
+    } else if lo.is_infinite() && hi.is_infinite() {
+        f32::NAN
+    } else if hi.is_infinite() {
+        above
+    } else {
+        1.0 - above
+    }
+}
+
+crate::multiversion! {
+    fn standard_row[T: Voxel, A: Sum](
+        kind: Spread, v: &[T], lo: &[T], hi: &[T], s: &[A], m: &[f64], n: &[f64], polarity: Polarity, out: &mut [f32]
+    ) -> bool = standard_inner;
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn standard_inner<T: Voxel, A: Sum>(
+    kind: Spread,
+    v: &[T],
+    lo: &[T],
+    hi: &[T],
+    s: &[A],
+    m: &[f64],
+    n: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) -> bool {
+    let len = out.len();
+    let (v, lo, hi, s, m, n) = (&v[..len], &lo[..len], &hi[..len], &s[..len], &m[..len], &n[..len]);
+    let sign = if polarity.flipped { 1.0 } else { -1.0 };
+    let mut wild = 0u32;
+    macro_rules! row {
+        ($of:expr) => {
+            for i in 0..len {
+                // n (v - mean) / (n sigma); a spread that underflowed leaves only the sign.
+                let d = sign * s[i].less(n[i], v[i].to_f64());
+                let z = (d / (n[i] * m[i]).max(f64::MIN_POSITIVE).sqrt()) as f32;
+                let y: f32 = $of(z);
+                wild |= !s[i].is_finite() as u32;
+                out[i] = if lo[i] == hi[i] { polarity.constant } else { y };
+            }
+        };
+    }
+    match kind {
+        Spread::Gaussian => row!(math::phi),
+        Spread::Chebyshev => row!(|z: f32| if z <= 0.0 { 0.0 } else { 1.0 - 1.0 / z.mul_add(z, 1.0) }),
+        Spread::Literal => row!(|z: f32| if z <= 0.0 { 1.0 } else { 1.0 / z.mul_add(z, 1.0) }),
+    }
+    wild != 0
+}
+
+/// A 3.3 and E 3.4 for a row.
+#[allow(clippy::too_many_arguments)]
+pub fn spread_row<T: Voxel, A: Sum>(
+    level: Level,
+    kind: Spread,
+    v: &[T],
+    lo: &[T],
+    hi: &[T],
+    s: &[A],
+    m: &[f64],
+    n: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) {
+    if standard_row(level, kind, v, lo, hi, s, m, n, polarity, out) {
+        for i in 0..out.len() {
+            let (v, lo, hi) = (v[i].to_f64(), lo[i].to_f64(), hi[i].to_f64());
+            if lo != hi && (lo.is_infinite() || hi.is_infinite()) {
+                out[i] = infinite(v, lo, hi, polarity.flipped, if kind == Spread::Literal { 1.0 } else { 0.0 });
+            }
+        }
+    }
+}

@@ -1,0 +1,495 @@
+//! Integer volumes: exact sums of unsigned codes, running along z and y, by a tree along x.
+//!
+//! Widths (n voxels in a window, m in its z-y section, w along z; codes up to T, squares up to T^2): a sum type serves
+//! an axis where the largest final value fits, since wrapped intermediate values cancel. [`run`] is instantiated per
+//! type by [`dispatch`], which checks the bounds.
+
+use super::emit::{Emit, IntRow};
+use super::estimate::{Acc, Code, RowSum, Width};
+use super::lines::{self, Add, Block, Coding, Elem, Hi, Lines, Lo, Masked, Op, Sources};
+use super::plan::{Job, Plain, Tile, cut, padded};
+use crate::grid::View;
+use crate::kernel::simd::Level;
+
+/// Sum types of the three axes for S1 and S2 (`go!(T, Z1, Y1, X1, Z2, Y2, X2, ..)`), the narrowest that fit.
+macro_rules! with_widths {
+    (u8, $job:expr, $go:ident!($($rest:tt)*)) => {{
+        let fits = Fits::of::<u8>($job);
+        if !fits.narrow {
+            $go!(u8, u64, u64, u64, u64, u64, u64, $($rest)*)
+        } else if fits.squares {
+            $go!(u8, u16, u32, u32, u32, u32, u32, $($rest)*)
+        } else {
+            $go!(u8, u16, u32, u32, u32, u32, u64, $($rest)*)
+        }
+    }};
+    (u16, $job:expr, $go:ident!($($rest:tt)*)) => {{
+        let fits = Fits::of::<u16>($job);
+        if fits.window {
+            $go!(u16, u32, u32, u32, u64, u64, u64, $($rest)*)
+        } else if fits.section {
+            $go!(u16, u32, u32, u64, u64, u64, u64, $($rest)*)
+        } else {
+            $go!(u16, u64, u64, u64, u64, u64, u64, $($rest)*)
+        }
+    }};
+    (u32, $job:expr, $go:ident!($($rest:tt)*)) => {{
+        Fits::of::<u32>($job);
+        $go!(u32, u64, u64, u64, u128, u128, u128, $($rest)*)
+    }};
+}
+
+/// Which sums fit. n < 2^31 is asserted, so u64 holds S1 of every type (2^63), S2 of 8 and 16-bit codes (2^63), and
+/// u128 the rest.
+struct Fits {
+    /// S1 of a window, and of its section, in u32.
+    window: bool,
+    section: bool,
+    /// S2 of a window in u32.
+    squares: bool,
+    /// S1 along z in u16, of the window in u32; S2 of the section in u32.
+    narrow: bool,
+}
+
+impl Fits {
+    fn of<T: Code>(job: &Job) -> Fits {
+        let (n, m) = job.counts();
+        let w = job.window[0].min(job.src[0]) as u64;
+        assert!(n < 1 << 31, "windows of {n} voxels");
+        let top = T::TOP as u128;
+        let fits = |count: u64, most: u128, bits: u32| (count as u128) * most < 1u128 << bits;
+        let (window, section) = (fits(n, top, 32), fits(m, top, 32));
+        let narrow = fits(w, top, 16) && window && fits(m, top * top, 32);
+        Fits { window, section, squares: fits(n, top * top, 32), narrow }
+    }
+}
+
+/// What a run needs besides the voxels.
+pub struct Setup<'a, T> {
+    pub job: &'a Job,
+    pub level: Level,
+    pub flip: T,
+    /// Code of missing voxels.
+    pub missing: Option<T>,
+}
+
+/// Runs every tile of a call over codes of type `T` (`flip` turns stored bits into codes).
+pub trait Dispatch: Code + Plain {
+    fn run(src: View<Self>, setup: &Setup<Self>, emit: &mut Emit, scratch: &mut [u8]);
+    fn bytes(job: &Job, masked: bool) -> usize;
+}
+
+macro_rules! go {
+    ($t:ident, $z1:ty, $y1:ty, $x1:ty, $z2:ty, $y2:ty, $x2:ty, $src:ident, $setup:ident, $emit:ident, $scratch:ident) => {
+        if $setup.missing.is_some() {
+            run::<$t, $z1, $y1, $x1, $z2, $y2, $x2, true>($src, $setup, $emit, $scratch)
+        } else {
+            run::<$t, $z1, $y1, $x1, $z2, $y2, $x2, false>($src, $setup, $emit, $scratch)
+        }
+    };
+}
+macro_rules! bytes {
+    ($t:ident, $z1:ty, $y1:ty, $x1:ty, $z2:ty, $y2:ty, $x2:ty, $job:ident, $masked:ident) => {
+        buffer_bytes::<$t, $z1, $y1, $x1, $z2, $y2, $x2>($job, $masked)
+    };
+}
+macro_rules! dispatch {
+    ($($t:ident)*) => {$(
+        impl Dispatch for $t {
+            fn run(src: View<$t>, setup: &Setup<$t>, emit: &mut Emit, scratch: &mut [u8]) {
+                with_widths!($t, setup.job, go!(src, setup, emit, scratch))
+            }
+            fn bytes(job: &Job, masked: bool) -> usize {
+                with_widths!($t, job, bytes!(job, masked))
+            }
+        }
+    )*};
+}
+dispatch!(u8 u16 u32);
+
+/// Buffers of one moment: a running plane over z, a running row over y, a row widened for x, its tree, its result.
+struct Moment<'a, Z, Y, X> {
+    plane: &'a mut [Z],
+    row: &'a mut [Y],
+    wide: &'a mut [X],
+    work: &'a mut [X],
+    out: &'a mut [X],
+}
+
+/// Elements of a tree along x of a row.
+fn tree_len(job: &Job) -> usize {
+    lines::tree_levels(job.window[2]) * (job.tile[1] + job.window[2])
+}
+
+impl<'a, Z: Plain, Y: Plain, X: Plain> Moment<'a, Z, Y, X> {
+    fn cut(job: &Job, wanted: bool, bytes: &mut &'a mut [u8]) -> Self {
+        let k = wanted as usize;
+        Moment {
+            plane: cut(bytes, k * job.plane()),
+            row: cut(bytes, k * job.pitch),
+            wide: cut(bytes, k * job.pitch),
+            work: cut(bytes, k * tree_len(job)),
+            out: cut(bytes, k * job.tile[1]),
+        }
+    }
+
+    fn bytes(job: &Job, wanted: bool) -> usize {
+        let (z, y) = (padded::<Z>(job.plane()), padded::<Y>(job.pitch));
+        let x = padded::<X>(job.pitch) + padded::<X>(tree_len(job)) + padded::<X>(job.tile[1]);
+        wanted as usize * (z + y + x)
+    }
+}
+
+fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain, X2: Plain>(
+    job: &Job,
+    masked: bool,
+) -> usize {
+    let k = job.needs.extremes as usize;
+    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
+    let rows = padded::<T>(2 * job.pitch) + 2 * padded::<T>(job.tile[1]);
+    k * (planes + rows)
+        + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
+        + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
+        + Moment::<u32, u32, u32>::bytes(job, masked)
+        + padded::<u32>(job.tile[1])
+}
+
+/// What becomes of a code in a running sum.
+trait Term<T>: Copy {
+    type Out;
+    fn of(self, code: T) -> Self::Out;
+}
+#[derive(Clone, Copy)]
+struct Plainly;
+#[derive(Clone, Copy)]
+struct Squared;
+#[derive(Clone, Copy)]
+struct Counted;
+impl<T: Code> Term<T> for Plainly {
+    type Out = T;
+    #[inline(always)]
+    fn of(self, code: T) -> T {
+        code
+    }
+}
+impl<T: Code> Term<T> for Squared {
+    type Out = T::Square;
+    #[inline(always)]
+    fn of(self, code: T) -> T::Square {
+        code.square()
+    }
+}
+impl<T: Code> Term<T> for Counted {
+    type Out = u8;
+    #[inline(always)]
+    fn of(self, _: T) -> u8 {
+        1
+    }
+}
+
+crate::multiversion! {
+    /// `run[i] += f(new[i]) - f(old[i])`; an empty slice stands for no row, a missing voxel for 0.
+    fn slide[T: Code, Z: Acc + From<<F as Term<T>>::Out>, F: Term<T>, const M: bool](
+        term: F, masked: Masked<M>, coding: Coding<T>, new: &[T], old: &[T], run: &mut [Z]
+    ) -> () = slide_inner;
+}
+
+#[inline(always)]
+fn slide_inner<T: Code, Z: Acc + From<F::Out>, F: Term<T>, const M: bool>(
+    term: F,
+    _: Masked<M>,
+    coding: Coding<T>,
+    new: &[T],
+    old: &[T],
+    run: &mut [Z],
+) {
+    let f = |v: T| {
+        let c = v.code(coding.flip);
+        let z = Z::from(term.of(c));
+        if M && c == coding.missing { Z::default() } else { z }
+    };
+    match (new.is_empty(), old.is_empty()) {
+        (false, false) => {
+            for ((r, a), b) in run.iter_mut().zip(new).zip(old) {
+                *r = r.plus(f(*a)).minus(f(*b));
+            }
+        }
+        (false, true) => {
+            for (r, a) in run.iter_mut().zip(new) {
+                *r = r.plus(f(*a));
+            }
+        }
+        (true, false) => {
+            for (r, b) in run.iter_mut().zip(old) {
+                *r = r.minus(f(*b));
+            }
+        }
+        (true, true) => {}
+    }
+}
+
+crate::multiversion! {
+    /// `run[i] += new[i] - old[i]`, and the same widened.
+    fn slide_rows[Z: Acc, Y: Acc + From<Z>](new: &[Z], old: &[Z], run: &mut [Y]) -> () = slide_rows_inner;
+}
+
+#[inline(always)]
+fn slide_rows_inner<Z: Acc, Y: Acc + From<Z>>(new: &[Z], old: &[Z], run: &mut [Y]) {
+    if old.is_empty() {
+        for (r, a) in run.iter_mut().zip(new) {
+            *r = r.plus(Y::from(*a));
+        }
+    } else {
+        for ((r, a), b) in run.iter_mut().zip(new).zip(old) {
+            *r = r.plus(Y::from(*a)).minus(Y::from(*b));
+        }
+    }
+}
+
+crate::multiversion! {
+    fn widen[Y: Acc, X: Acc + From<Y>](from: &[Y], to: &mut [X]) -> () = widen_inner;
+}
+
+#[inline(always)]
+fn widen_inner<Y: Acc, X: Acc + From<Y>>(from: &[Y], to: &mut [X]) {
+    for (t, f) in to.iter_mut().zip(from) {
+        *t = X::from(*f);
+    }
+}
+
+impl<Z: Acc, Y: Acc + From<Z>, X: Acc + From<Y>> Moment<'_, Z, Y, X>
+where
+    Add: Op<X>,
+{
+    /// Starts the running row with all but the last row of the first window.
+    fn begin_rows(&mut self, level: Level, job: &Job) {
+        self.row.fill(Y::default());
+        for y in 0..job.window[1] - 1 {
+            slide_rows(level, &self.plane[y * job.pitch..][..job.pitch], &[], self.row);
+        }
+    }
+
+    /// Sums of the windows of output row `y` of the tile, left in `out`.
+    fn finish_row(&mut self, level: Level, job: &Job, y: usize) {
+        let line = |y: usize| &self.plane[y * job.pitch..][..job.pitch];
+        let old = if y == 0 { &[] } else { line(y - 1) };
+        slide_rows(level, line(y + job.window[1] - 1), old, self.row);
+        widen(level, self.row, self.wide);
+        lines::tree_sum(level, self.wide, job.window[2], 1, self.out, self.work);
+    }
+}
+
+#[allow(clippy::too_many_arguments)]
+fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
+    src: View<T>,
+    setup: &Setup<T>,
+    emit: &mut Emit,
+    mut scratch: &mut [u8],
+) where
+    T: Code + Plain,
+    Z1: Acc + Plain + From<T>,
+    Y1: Acc + Plain + From<Z1>,
+    X1: RowSum + Plain + From<Y1>,
+    Z2: Acc + Plain + From<T::Square>,
+    Y2: Acc + Plain + From<Z2>,
+    X2: Acc + Plain + From<Y2>,
+    Add: Op<X1> + Op<X2>,
+{
+    let Setup { job, level, flip, missing } = *setup;
+    let needs = job.needs;
+    let bytes = &mut scratch;
+    let k = needs.extremes as usize;
+    let lo = cut::<T>(bytes, k * job.batch * job.plane());
+    let hi = cut::<T>(bytes, k * job.batch * job.plane());
+    let row_lo = cut::<T>(bytes, k * job.rows * job.pitch);
+    let row_hi = cut::<T>(bytes, k * job.rows * job.pitch);
+    let work = cut::<T>(bytes, k * 2 * job.pitch);
+    let out_lo = cut::<T>(bytes, k * job.tile[1]);
+    let out_hi = cut::<T>(bytes, k * job.tile[1]);
+    let mut s1 = Moment::<Z1, Y1, X1>::cut(job, needs.mean, bytes);
+    let mut s2 = Moment::<Z2, Y2, X2>::cut(job, needs.variance, bytes);
+    let mut count = Moment::<u32, u32, u32>::cut(job, M, bytes);
+    let n = cut::<u32>(bytes, job.tile[1]);
+    let coding = Coding { flip, missing: missing.unwrap_or_default() };
+    let plain = Coding { flip: T::default(), missing: T::default() };
+    let width = Width::of(job.counts().0, T::TOP);
+    for tile in Tile::all(job) {
+        let (y, x) = (tile.y, tile.x);
+        lo.fill(T::GREATEST);
+        hi.fill(T::LEAST);
+        s1.plane.fill(Z1::default());
+        s2.plane.fill(Z2::default());
+        count.plane.fill(0);
+        let slide_in = |new: Option<usize>,
+                        old: Option<usize>,
+                        s1: &mut Moment<Z1, Y1, X1>,
+                        s2: &mut Moment<Z2, Y2, X2>,
+                        count: &mut Moment<u32, u32, u32>| {
+            for j in tile.rows.0..tile.rows.1 {
+                let part = |z: usize| {
+                    let (first, len) = (tile.cols.2, tile.cols.1 - tile.cols.0);
+                    &src.row_at(z, tile.rows.2 + j - tile.rows.0)[first..first + len]
+                };
+                let (new, old) = (new.map_or(&[][..], part), old.map_or(&[][..], part));
+                let span = tile.span(job, j);
+                if needs.mean {
+                    slide(level, Plainly, Masked::<M>, coding, new, old, &mut s1.plane[span.clone()]);
+                }
+                if needs.variance {
+                    slide(level, Squared, Masked::<M>, coding, new, old, &mut s2.plane[span.clone()]);
+                }
+                if M {
+                    slide(level, Counted, Masked::<M>, coding, new, old, &mut count.plane[span]);
+                }
+            }
+        };
+        // The window of the plane before the first output; each output then adds one plane and drops one.
+        let (reach, first) = (job.radius[0], job.at[0]);
+        for z in (first as isize - 1 - reach as isize).max(0) as usize..(first + reach).min(job.src[0]) {
+            slide_in(Some(z), None, &mut s1, &mut s2, &mut count);
+        }
+        for z0 in (0..job.dst[0]).step_by(job.batch) {
+            if needs.extremes {
+                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi);
+            }
+            for z in z0..(z0 + job.batch).min(job.dst[0]) {
+                let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
+                let old = (first + z).checked_sub(reach + 1);
+                slide_in(new, old, &mut s1, &mut s2, &mut count);
+                if !M {
+                    let section = job.count(0, z);
+                    for (i, n) in n[..tile.size[1]].iter_mut().enumerate() {
+                        *n = (section * job.count(2, x + i)) as u32; // times the rows, below
+                    }
+                }
+                let mut rows_counted = 1;
+                if needs.mean {
+                    s1.begin_rows(level, job);
+                }
+                if needs.variance {
+                    s2.begin_rows(level, job);
+                }
+                if M {
+                    count.begin_rows(level, job);
+                }
+                let plane = (z - z0) * job.plane();
+                for j in 0..tile.size[0] {
+                    if needs.extremes {
+                        if j % job.rows == 0 {
+                            let from = [&lo[plane..plane + job.plane()], &hi[plane..plane + job.plane()]];
+                            rows_extremes(level, job, from, j, plain, row_lo, row_hi);
+                        }
+                        let line = (j % job.rows) * job.pitch;
+                        let w = job.window[2];
+                        lines::tree_extreme(level, Lo, &row_lo[line..line + job.pitch], w, 1, out_lo, work);
+                        lines::tree_extreme(level, Hi, &row_hi[line..line + job.pitch], w, 1, out_hi, work);
+                    }
+                    if needs.mean {
+                        s1.finish_row(level, job, j);
+                    }
+                    if needs.variance {
+                        s2.finish_row(level, job, j);
+                    }
+                    if M {
+                        count.finish_row(level, job, j);
+                    } else {
+                        let rows = job.count(1, y + j);
+                        if rows != rows_counted {
+                            n.iter_mut().for_each(|n| *n = *n / rows_counted as u32 * rows as u32);
+                            rows_counted = rows;
+                        }
+                    }
+                    let at = [job.at[0] + z, job.at[1] + y + j];
+                    let first = job.at[2] + x;
+                    let row = IntRow {
+                        v: &src.row_at(at[0], at[1])[first..first + tile.size[1]],
+                        lo: out_lo,
+                        hi: out_hi,
+                        s1: s1.out,
+                        s2: s2.out,
+                        n: if M { count.out } else { n },
+                        width,
+                    };
+                    emit.int_row(setup, row, [z, y + j, x]);
+                }
+            }
+        }
+    }
+}
+
+/// Extremes over z of a batch of output planes, straight from `src`.
+#[allow(clippy::too_many_arguments)]
+fn planes_extremes<T: Code, const M: bool>(
+    level: Level,
+    job: &Job,
+    tile: &Tile,
+    src: View<T>,
+    z0: usize,
+    coding: Coding<T>,
+    lo: &mut [T],
+    hi: &mut [T],
+) {
+    let cols = tile.cols.1 - tile.cols.0;
+    for j in tile.rows.0..tile.rows.1 {
+        let lines = Lines {
+            base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
+            pitch: src.plane,
+            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
+            clip: (0, job.src[0] as isize),
+        };
+        let out = (tile.span(job, j).start, job.plane());
+        blocked(
+            level,
+            job.batch,
+            Masked::<M>,
+            Sources::<false>,
+            [src.data; 2],
+            lines,
+            job.window[0],
+            cols,
+            coding,
+            lo,
+            hi,
+            out,
+        );
+    }
+}
+
+/// Extremes over y of a block of output rows from `j` on.
+pub fn rows_extremes<T: Elem>(
+    level: Level,
+    job: &Job,
+    from: [&[T]; 2],
+    j: usize,
+    plain: Coding<T>,
+    lo: &mut [T],
+    hi: &mut [T],
+) {
+    let lines = Lines { base: 0, pitch: job.pitch, first: j as isize, clip: (0, job.height as isize) };
+    let (w, out) = (job.window[1], (0, job.pitch));
+    blocked(level, job.rows, Masked::<false>, Sources::<true>, from, lines, w, job.pitch, plain, lo, hi, out);
+}
+
+/// [`lines::extremes`] for a block length known at run time.
+#[allow(clippy::too_many_arguments)]
+pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
+    level: Level,
+    block: usize,
+    masked: Masked<M>,
+    sources: Sources<TWO>,
+    src: [&[T]; 2],
+    lines: Lines,
+    w: usize,
+    cols: usize,
+    coding: Coding<T>,
+    lo: &mut [T],
+    hi: &mut [T],
+    out: (usize, usize),
+) {
+    match block {
+        1 => lines::extremes(level, Block::<1>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
+        4 => lines::extremes(level, Block::<4>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
+        8 => lines::extremes(level, Block::<8>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
+        _ => unreachable!("blocks are 1, 4 or 8 lines"),
+    }
+}

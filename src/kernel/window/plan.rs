@@ -1,0 +1,196 @@
+//! Which moments a set of channels needs, how a call is cut into tiles, and how its scratch is laid out.
+
+use crate::grid::{DType, Shape};
+use crate::stage::{Method, WindowChannel, WindowParams};
+
+/// Moments to compute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Needs {
+    pub extremes: bool,
+    pub mean: bool,
+    pub variance: bool,
+}
+
+impl Needs {
+    /// For integers an exact variance of zero says that a window is constant; floats ask the extremes.
+    pub fn of(channels: impl Iterator<Item = WindowChannel>, float: bool) -> Needs {
+        let mut needs = Needs { extremes: false, mean: false, variance: false };
+        for channel in channels {
+            match channel {
+                WindowChannel::Mean => needs.mean = true,
+                WindowChannel::Min | WindowChannel::Max => needs.extremes = true,
+                WindowChannel::Variance | WindowChannel::Std | WindowChannel::Moment2 => {
+                    (needs.mean, needs.variance) = (true, true)
+                }
+                WindowChannel::Openness(Method::Exact, _) => panic!("exact openness has a kernel of its own"),
+                WindowChannel::Openness(Method::CdfPower, _) => (needs.extremes, needs.mean) = (true, true),
+                WindowChannel::Openness(..) => {
+                    (needs.mean, needs.variance) = (true, true);
+                    needs.extremes |= float;
+                }
+            }
+        }
+        needs
+    }
+}
+
+/// One call: shapes, windows and tiles. All `[z, y, x]`.
+#[derive(Debug, Clone, Copy)]
+pub struct Job {
+    pub src: Shape,
+    pub dst: Shape,
+    pub at: [usize; 3],
+    /// Radius, at most the extent of `src` less one: there a larger one changes no window, and bricks cannot disagree,
+    /// since a radius beyond that makes every brick's `src` the whole axis.
+    pub radius: [usize; 3],
+    /// `2 radius + 1`.
+    pub window: [usize; 3],
+    pub needs: Needs,
+    /// Output rows and columns of a tile.
+    pub tile: [usize; 2],
+    /// Output planes whose extremes are made together.
+    pub batch: usize,
+    /// Output rows whose extremes are made together.
+    pub rows: usize,
+    /// Elements from row to row of tile buffers.
+    pub pitch: usize,
+    /// Rows of tile buffers.
+    pub height: usize,
+}
+
+impl Job {
+    /// `element` is the size of a voxel, `moments` the bytes per voxel of the planes that a batch keeps.
+    pub fn new(src: Shape, dst: Shape, at: [usize; 3], params: &WindowParams, needs: Needs, moments: usize) -> Job {
+        let radius: [usize; 3] = std::array::from_fn(|a| params.radius[a].min(src[a].saturating_sub(1)));
+        let window = radius.map(|r| 2 * r + 1);
+        let width = even(dst[2], MAX_WIDTH);
+        let pitch = odd_lines(width + 2 * radius[2]);
+        let batch = block(window[0], dst[0]);
+        let rows =
+            (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
+        let tile = [even(dst[1], rows), width];
+        let height = tile[0] + 2 * radius[1];
+        Job { src, dst, at, radius, window, needs, tile, batch, rows: block(window[1], tile[0]), pitch, height }
+    }
+
+    /// Most voxels in a window, and in its z-y section.
+    pub fn counts(&self) -> (u64, u64) {
+        let n: [u64; 3] = std::array::from_fn(|a| self.window[a].min(self.src[a]) as u64);
+        (n[0] * n[1] * n[2], n[0] * n[1])
+    }
+
+    /// Voxels of output index `i` of axis `a` that exist in its window.
+    pub fn count(&self, a: usize, i: usize) -> usize {
+        let c = self.at[a] + i;
+        (c + self.radius[a] + 1).min(self.src[a]) - c.saturating_sub(self.radius[a])
+    }
+
+    /// Elements of a tile plane.
+    pub fn plane(&self) -> usize {
+        self.height * self.pitch
+    }
+}
+
+/// Widest tile in x.
+const MAX_WIDTH: usize = 512;
+/// Fewest rows of a tile (if there are as many).
+const MIN_ROWS: usize = 32;
+/// Bytes of batch planes to aim at: they and the raw planes share a 1 MiB L2.
+const TILE_BYTES: usize = 640 << 10;
+
+/// Parts as even as can be of at most `most`.
+fn even(n: usize, most: usize) -> usize {
+    n.div_ceil(n.div_ceil(most).max(1)).max(1)
+}
+
+/// A multiple of 64 elements, odd in 64s: power-of-two pitches would map a column to few cache sets.
+fn odd_lines(n: usize) -> usize {
+    (n.div_ceil(64) | 1) * 64
+}
+
+/// Outputs made together by `lines::extremes`: 1, 4 or 8, at most the window.
+fn block(window: usize, outputs: usize) -> usize {
+    match window {
+        ..4 => 1,
+        4..8 => 4,
+        _ if outputs <= 4 => 4,
+        _ => 8,
+    }
+}
+
+/// The part of a tile's buffer that `src` covers along an axis: buffer indices `lo..hi`, the first being `src` index
+/// `first`. `start` is the tile's first output index and `len` the buffer's extent.
+fn covered(job: &Job, axis: usize, start: usize, len: usize) -> (usize, usize, usize) {
+    let begin = (job.at[axis] + start) as isize - job.radius[axis] as isize;
+    let lo = (-begin).max(0) as usize;
+    let hi = ((job.src[axis] as isize - begin).max(0) as usize).min(len);
+    (lo, hi.max(lo), (begin + lo as isize) as usize)
+}
+
+/// Where a tile lies.
+pub struct Tile {
+    /// First output row and column.
+    pub y: usize,
+    pub x: usize,
+    /// Output rows and columns.
+    pub size: [usize; 2],
+    /// Rows of the buffer that `src` covers, and the first of them in `src`; columns likewise.
+    pub rows: (usize, usize, usize),
+    pub cols: (usize, usize, usize),
+}
+
+impl Tile {
+    pub fn new(job: &Job, y: usize, x: usize) -> Tile {
+        let size = [job.tile[0].min(job.dst[1] - y), job.tile[1].min(job.dst[2] - x)];
+        let rows = covered(job, 1, y, size[0] + 2 * job.radius[1]);
+        let cols = covered(job, 2, x, size[1] + 2 * job.radius[2]);
+        Tile { y, x, size, rows, cols }
+    }
+
+    /// Every tile of a call.
+    pub fn all(job: &Job) -> impl Iterator<Item = Tile> + '_ {
+        let ys = (0..job.dst[1]).step_by(job.tile[0]);
+        ys.flat_map(move |y| (0..job.dst[2]).step_by(job.tile[1]).map(move |x| Tile::new(job, y, x)))
+    }
+
+    /// Part of buffer row `j` that `src` covers, as element indices of a plane.
+    pub fn span(&self, job: &Job, j: usize) -> std::ops::Range<usize> {
+        j * job.pitch + self.cols.0..j * job.pitch + self.cols.1
+    }
+}
+
+/// Takes `len` elements off the front of 64-byte-aligned scratch. Panics if it is too short.
+///
+/// `T` is one of the plain numbers of this module (u8 to u128, f32, f64 or pairs of f64).
+pub fn cut<'a, T: Plain>(bytes: &mut &'a mut [u8], len: usize) -> &'a mut [T] {
+    let (head, tail) = std::mem::take(bytes).split_at_mut(padded::<T>(len));
+    *bytes = tail;
+    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
+    // SAFETY: aligned (just checked) and long enough; `Plain` types take every bit pattern.
+    unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }
+}
+
+/// Bytes that [`cut`] takes.
+pub fn padded<T>(len: usize) -> usize {
+    (len * size_of::<T>()).div_ceil(64) * 64
+}
+
+/// Types of which every bit pattern is a value and whose alignment divides 64.
+///
+/// # Safety
+/// Implement for plain numbers only.
+pub unsafe trait Plain: Copy {}
+macro_rules! plain {
+    ($($t:ty)*) => {$(
+        // SAFETY: a primitive number without padding.
+        unsafe impl Plain for $t {}
+    )*};
+}
+plain!(u8 u16 u32 u64 u128 f32 f64);
+
+/// Bytes per voxel of the moments of a batch of planes.
+pub fn batch_bytes(dtype: DType, needs: Needs) -> usize {
+    let size = dtype.size();
+    let sums = if dtype.is_float() { 8 * needs.mean as usize + 8 * needs.variance as usize } else { 0 };
+    (2 * size * needs.extremes as usize + sums).max(1)
+}

@@ -1,0 +1,218 @@
+//! Bricks never show (SPEC 5.1): one result for every brick, thread count, budget, region and way of skipping.
+
+mod common;
+
+use std::path::Path;
+
+use common::*;
+
+const SHAPE: [usize; 3] = [61, 75, 83];
+
+/// Every kind of stage in one graph, over `vol.npy`.
+const CONFIG: &str = r#"
+[input.vol]
+path = "vol.npy"
+spacing = [2, 1, 1]
+
+[stage.stats]
+op = "box"
+input = "vol"
+radius = [2, 3, 4]
+[stage.ao]
+op = "ambient_occlusion"
+input = "vol"
+method = "cdf_power"
+radius = [2, 3, 4]
+[stage.rank]
+op = "ambient_occlusion"
+input = "vol"
+method = "exact"
+radius = 2
+border = "reflect"
+[stage.bell]
+op = "gaussian"
+input = "vol"
+sigma = 1.3
+[stage.slope]
+op = "gradient"
+input = "vol"
+[stage.map]
+op = "occlusion_map"
+input = "vol"
+[stage.sweep]
+op = "obscurance"
+input = "vol"
+directions = 12
+max_distance = 9
+[stage.masked]
+op = "ambient_occlusion"
+input = "vol"
+method = "gaussian_cdf"
+radius = 3
+where = { input = "vol", min = 33000 }
+[stage.edge]
+op = "saliency"
+input = "sweep"
+size = 3
+scale = "max"
+[stage.light]
+op = "combine"
+inputs = ["ao", "rank", "sweep"]
+op_kind = "mean"
+
+[output.stats]
+path = "out/stats.zarr"
+from = "stats.variance"
+reduce = "moments"
+chunk = 16
+shard = 32
+levels = 5
+[output.extremes]
+path = "out/extremes.zarr"
+from = ["stats.min", "stats.max"]
+chunk = [16, 8, 16]
+shard = "none"
+codec = "zstd:1"
+[output.ao]
+path = "out/ao.zarr"
+from = "ao"
+chunk = 16
+shard = 48
+[output.rank]
+path = "out/rank.npy"
+from = "rank"
+dtype = "f32"
+[output.bell]
+path = "out/bell.zarr"
+from = ["bell.mean", "bell.variance"]
+chunk = 24
+[output.slope]
+path = "out/slope.zarr"
+from = "slope.vector"
+chunk = 32
+format = "ome-zarr-0.4"
+[output.map]
+path = "out/map.zarr"
+from = ["map.mean", "map.variance"]
+chunk = 4
+shard = 8
+[output.masked]
+path = "out/masked.zarr"
+from = "masked"
+dtype = "f32"
+chunk = 16
+[output.edge]
+path = "out/edge.zarr"
+from = "edge"
+dtype = "u8"
+range = "auto"
+chunk = 16
+[output.light]
+path = "out/light.raw"
+from = "light"
+"#;
+
+const OUTPUTS: [&str; 10] = [
+    "stats.zarr",
+    "extremes.zarr",
+    "ao.zarr",
+    "rank.npy",
+    "bell.zarr",
+    "slope.zarr",
+    "map.zarr",
+    "masked.zarr",
+    "edge.zarr",
+    "light.raw",
+];
+
+/// Runs and decodes every output; raw files are taken as they are.
+fn results(dir: &Path, sets: &[&str]) -> Vec<(Decoded, String)> {
+    run(dir, CONFIG, sets);
+    OUTPUTS.iter().map(|name| one(&dir.join("out").join(name))).collect()
+}
+
+fn one(path: &Path) -> (Decoded, String) {
+    if path.extension().is_some_and(|e| e == "raw") {
+        let bytes = std::fs::read(path).unwrap();
+        let numbers = bytes.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes(b.try_into().unwrap())).to_bits());
+        return ([("raw".to_string(), (SHAPE.to_vec(), numbers.collect()))].into(), String::new());
+    }
+    let meta = if path.is_dir() { format!("{:?}", metadata(path)) } else { String::new() };
+    (decode(path), meta)
+}
+
+fn volume() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    write_npy(&dir.path().join("vol.npy"), "<u2", SHAPE, &u16_bytes(&mixed_u16(SHAPE)));
+    dir
+}
+
+#[test]
+fn bricks_threads_and_budgets_never_show() {
+    let dir = volume();
+    let first = results(dir.path(), &["run.brick=128", "run.threads=1"]);
+    let variants: [&[&str]; 6] = [
+        &["run.brick=8", "run.threads=2"],
+        &["run.brick=[16, 24, 40]", "run.threads=3"],
+        &["run.brick=[61, 8, 83]", "run.threads=2"],
+        &["run.memory=64MiB", "run.threads=2"],
+        &["run.memory=4GiB", "run.threads=5"],
+        &["run.brick=[8, 80, 16]", "run.threads=1"],
+    ];
+    for sets in variants {
+        let other = results(dir.path(), sets);
+        for ((name, a), b) in OUTPUTS.iter().zip(&first).zip(&other) {
+            assert_same(&format!("{name} with {sets:?}"), &a.0, &b.0);
+            assert_eq!(a.1, b.1, "metadata of {name} with {sets:?}");
+        }
+    }
+}
+
+#[test]
+fn skipping_never_shows() {
+    let dir = volume();
+    let sets = ["run.brick=16", "run.threads=2"];
+    let skipped = results(dir.path(), &sets);
+    let config = parse(dir.path(), CONFIG, &sets);
+    let options = occlude::run::RunOptions { overwrite: true, no_skip: true, ..Default::default() };
+    run_with(&config, &options);
+    for (name, a) in OUTPUTS.iter().zip(&skipped) {
+        assert_same(name, &a.0, &one(&dir.path().join("out").join(name)).0);
+    }
+}
+
+#[test]
+fn a_region_is_that_part_of_the_whole() {
+    let dir = volume();
+    let whole = results(dir.path(), &["run.threads=2"]);
+    let (lo, hi) = ([9, 21, 30], [50, 64, 83]);
+    let part = results(dir.path(), &["run.threads=2", "run.region=[[9, 50], [21, 64], [30, 83]]", "run.brick=24"]);
+    for ((name, a), b) in OUTPUTS.iter().zip(&whole).zip(&part) {
+        // An occlusion map's first dataset is a level of the region's own chain.
+        if *name == "map.zarr" {
+            continue;
+        }
+        for (array, (_, values)) in b.0.iter().filter(|(k, _)| k.starts_with("level 0") || *k == "raw") {
+            let mut i = 0;
+            for z in lo[0]..hi[0] {
+                for y in lo[1]..hi[1] {
+                    for x in lo[2]..hi[2] {
+                        let there = a.0[array].1[(z * SHAPE[1] + y) * SHAPE[2] + x];
+                        assert_eq!(values[i], there, "{name} {array} at {:?} of the volume", [z, y, x]);
+                        i += 1;
+                    }
+                }
+            }
+            assert_eq!(i, values.len());
+        }
+    }
+}
+
+#[test]
+fn the_comparison_names_a_changed_voxel() {
+    let a: Decoded = [("level 0".to_string(), (vec![2, 3, 4], vec![0u64; 24]))].into();
+    let mut b = a.clone();
+    assert_eq!(difference(&a, &b), None);
+    b.get_mut("level 0").unwrap().1[17] = 1;
+    assert!(difference(&a, &b).unwrap().contains("[1, 1, 1]"), "{:?}", difference(&a, &b));
+}
