@@ -1,7 +1,15 @@
 //! Penner's filterable occlusion map: a pyramid of pooled moments (paper E).
+//!
+//! Blurring and halving an axis are one pass here: a cell pools the two blurred cells that it covers, which is a pool of six
+//! finer cells with weights (1 5 10 10 5 1)/32 away from the ends. Variances are pooled as mean of variances plus variance
+//! of means, which is what pooling twice gives too. Axes follow each other (z, y, x); an axis passes over NaN cells: the five
+//! taps of each blurred cell, and the two blurred cells, are renormalised to what is valid.
 
 use super::Context;
-use crate::grid::{Affine, AnyView, Region};
+use super::values::{BLOCK, blocks, load_any};
+use crate::brick::scratch::{cut, padded};
+use crate::grid::{Affine, AnyView, Region, Shape};
+use crate::multiversion;
 
 /// Unrounded pooled moments of one level, dense over a box: `variance` is the population variance of the pooled values.
 /// A cell without valid voxels has NaN in both.
@@ -11,22 +19,40 @@ pub struct Moments {
     pub variance: Vec<f64>,
 }
 
-/// Level 0: the data, scaled, variance 0; missing voxels NaN.
+impl Moments {
+    fn resize(&mut self, len: usize) {
+        self.mean.resize(len, 0.0);
+        self.variance.resize(len, 0.0);
+    }
+}
+
+/// Level 0: the data, scaled, variance 0; missing voxels NaN in both.
 pub fn base(src: AnyView, affine: Affine, missing: Option<i64>, dst: &mut Moments) {
-    let _ = (src, affine, missing, dst);
-    todo!()
+    let [nz, ny, nx] = src.shape();
+    dst.resize(nz * ny * nx);
+    for ([z, y, x], n) in blocks(src.shape()) {
+        let start = (z * ny + y) * nx + x;
+        let mean = &mut dst.mean[start..start + n];
+        load_any(&src, [z, y, x], missing, mean);
+        if !affine.is_identity() {
+            mean.iter_mut().for_each(|m| *m = affine.apply(*m));
+        }
+        let variance = &mut dst.variance[start..start + n];
+        variance.iter_mut().zip(mean).for_each(|(v, m)| *v = if m.is_nan() { f64::NAN } else { 0.0 });
+    }
 }
 
 /// The box of the finer level (shape `fine_volume`) that [`coarsen`] needs for the box `coarse` of the next level, where
 /// `halve[a]` says whether axis a is blurred and halved.
 pub fn needed(coarse: Region, halve: [bool; 3], fine_volume: [usize; 3]) -> Region {
-    let _ = (coarse, halve, fine_volume);
-    todo!()
+    let one = |a: usize, lo: i64, hi: i64| if halve[a] { (2 * lo - 2, 2 * hi + 2) } else { (lo, hi) };
+    let ends: [(i64, i64); 3] = std::array::from_fn(|a| one(a, coarse.lo[a], coarse.hi[a]));
+    Region::new(ends.map(|e| e.0), ends.map(|e| e.1)).clip(&Region::whole(fine_volume))
 }
 
 /// One step of the chain: on each halved axis the 5 taps (1 4 6 4 1)/16, renormalised to the voxels that exist, then
 /// cell-centred halving (cell i pools blurred 2i and 2i + 1, where they exist). `fine` covers `fine_box` of a level of shape
-/// `fine_volume`, `dst` gets `coarse_box` of the next.
+/// `fine_volume`, `dst` gets `coarse_box` of the next. Panics if `fine_box` lacks cells that [`needed`] names.
 #[allow(clippy::too_many_arguments)]
 pub fn coarsen(
     fine: &Moments,
@@ -37,6 +63,374 @@ pub fn coarsen(
     dst: &mut Moments,
     cx: &mut Context,
 ) {
-    let _ = (fine, fine_box, fine_volume, halve, coarse_box, dst, cx);
-    todo!()
+    let want = needed(coarse_box, halve, fine_volume);
+    assert!(fine_box.contains(&want), "cells {want:?} are needed, {fine_box:?} are given");
+    dst.resize(coarse_box.voxels());
+    if coarse_box.is_empty() {
+        return;
+    }
+    let (n, c) = (want.shape(), coarse_box.shape());
+    let source = Grid { shape: fine_box.shape(), at: fine_box.offset_of(&want) };
+    let steps = Steps { halve, volume: fine_volume, fine: want.lo, coarse: coarse_box.lo };
+    let (wide, middle) = (n[1] * n[2], c[1] * n[2]);
+    let bytes = cx.scratch.take(2 * (padded::<f64>(wide) + padded::<f64>(middle) + padded::<f64>(2 * n[2] + 8)));
+    let (zm, bytes) = cut::<f64>(bytes, wide);
+    let (zv, bytes) = cut::<f64>(bytes, wide);
+    let (ym, bytes) = cut::<f64>(bytes, middle);
+    let (yv, bytes) = cut::<f64>(bytes, middle);
+    let (split_m, bytes) = cut::<f64>(bytes, 2 * n[2] + 8);
+    let (split_v, _) = cut::<f64>(bytes, 2 * n[2] + 8);
+    for z in 0..c[0] {
+        for y in 0..n[1] {
+            let row = |z: usize| source.row(z, y);
+            let out = [&mut zm[y * n[2]..][..n[2]], &mut zv[y * n[2]..][..n[2]]];
+            steps.rows(cx.level, 0, z, [&fine.mean, &fine.variance], row, out);
+        }
+        for y in 0..c[1] {
+            let out = [&mut ym[y * n[2]..][..n[2]], &mut yv[y * n[2]..][..n[2]]];
+            steps.rows(cx.level, 1, y, [zm, zv], |y| y * n[2], out);
+        }
+        for y in 0..c[1] {
+            let from = [&ym[y * n[2]..][..n[2]], &yv[y * n[2]..][..n[2]]];
+            let start = (z * c[1] + y) * c[2];
+            let out = [&mut dst.mean[start..start + c[2]], &mut dst.variance[start..start + c[2]]];
+            steps.along_x(cx.level, from, [&mut *split_m, &mut *split_v], out);
+        }
+    }
+}
+
+/// Where the needed box lies in the buffer of the finer level.
+struct Grid {
+    shape: Shape,
+    at: [usize; 3],
+}
+
+impl Grid {
+    fn row(&self, z: usize, y: usize) -> usize {
+        ((self.at[0] + z) * self.shape[1] + self.at[1] + y) * self.shape[2] + self.at[2]
+    }
+}
+
+/// The passes of one step of the chain.
+struct Steps {
+    halve: [bool; 3],
+    volume: Shape,
+    /// First cells of the needed and of the coarse box.
+    fine: [i64; 3],
+    coarse: [i64; 3],
+}
+
+/// Weights of fine cells 2i - 2 .. 2i + 3 in coarse cell i of an axis of `n` fine cells, where `valid` are valid: each of
+/// the blurred cells 2i and 2i + 1 pools its five taps, and the cell pools those of the two that exist and are valid.
+fn six_weights(i: i64, n: i64, valid: [bool; 6]) -> [f64; 6] {
+    const TAPS: [f64; 5] = [1.0, 4.0, 6.0, 4.0, 1.0];
+    let mut blurred = [[0.0; 6]; 2];
+    let mut found = 0.0;
+    for (j, blurred) in blurred.iter_mut().enumerate() {
+        if 2 * i + j as i64 >= n {
+            continue;
+        }
+        let mut total = 0.0;
+        for (k, tap) in TAPS.iter().enumerate() {
+            let cell = 2 * i - 2 + (j + k) as i64;
+            if (0..n).contains(&cell) && valid[j + k] {
+                blurred[j + k] = *tap;
+                total += *tap;
+            }
+        }
+        if total > 0.0 {
+            blurred.iter_mut().for_each(|w| *w /= total);
+            found += 1.0;
+        }
+    }
+    std::array::from_fn(|k| if found > 0.0 { (blurred[0][k] + blurred[1][k]) / found } else { 0.0 })
+}
+
+impl Steps {
+    /// Cell `i` of the coarse box along `axis`, as a global index.
+    fn global(&self, axis: usize, i: usize) -> i64 {
+        self.coarse[axis] + i as i64
+    }
+
+    /// Fine cell `k` (0 to 5) of coarse cell `i`, as an index into the needed box; the nearest one that exists where it
+    /// does not (its weight is 0).
+    fn tap(&self, axis: usize, i: i64, k: usize) -> usize {
+        let n = self.volume[axis] as i64;
+        ((2 * i - 2 + k as i64).clamp(0, n - 1) - self.fine[axis]) as usize
+    }
+
+    /// Pass along z or y: pools the six rows of coarse cell `i`; `row` gives the place of a row of the needed box.
+    fn rows(
+        &self,
+        level: super::simd::Level,
+        axis: usize,
+        i: usize,
+        from: [&[f64]; 2],
+        row: impl Fn(usize) -> usize,
+        out: [&mut [f64]; 2],
+    ) {
+        let n = out[0].len();
+        let i = self.global(axis, i);
+        let [means, variances] = from;
+        let [out_m, out_v] = out;
+        if !self.halve[axis] {
+            let place = row((i - self.fine[axis]) as usize);
+            out_m.copy_from_slice(&means[place..place + n]);
+            out_v.copy_from_slice(&variances[place..place + n]);
+            return;
+        }
+        let places: [usize; 6] = std::array::from_fn(|k| row(self.tap(axis, i, k)));
+        let cells = Six {
+            mean: places.map(|p| &means[p..p + n]),
+            variance: places.map(|p| &variances[p..p + n]),
+            weight: six_weights(i, self.volume[axis] as i64, [true; 6]),
+        };
+        if !pool(level, &cells, out_m, out_v) {
+            mend(&cells, |_| (i, self.volume[axis] as i64), out_m, out_v);
+        }
+    }
+
+    /// Pass along x: the row's even and odd cells are set apart, so that taps are whole rows again; a missing cell at an
+    /// end is a copy of the nearest, as in [`Steps::tap`], and ends are pooled one by one.
+    fn along_x(&self, level: super::simd::Level, from: [&[f64]; 2], split: [&mut [f64]; 2], out: [&mut [f64]; 2]) {
+        let [out_m, out_v] = out;
+        let n = out_m.len();
+        if !self.halve[2] {
+            out_m.copy_from_slice(from[0]);
+            out_v.copy_from_slice(from[1]);
+            return;
+        }
+        let first = self.global(2, 0);
+        let halves = n + 2; // even or odd cells from 2 (first - 1) on
+        let [split_m, split_v] = split;
+        for (split, from) in [(&mut *split_m, from[0]), (&mut *split_v, from[1])] {
+            let (even, odd) = split[..2 * halves].split_at_mut(halves);
+            let last = from.len() as i64 - 1;
+            let start = 2 * (first - 1) - self.fine[2];
+            for (h, (even, odd)) in even.iter_mut().zip(odd).enumerate() {
+                let cell = start + 2 * h as i64;
+                *even = from[cell.clamp(0, last) as usize];
+                *odd = from[(cell + 1).clamp(0, last) as usize];
+            }
+        }
+        let taps: [usize; 6] = std::array::from_fn(|k| (k % 2) * halves + k / 2);
+        let (split_m, split_v) = (&*split_m, &*split_v);
+        let volume = self.volume[2] as i64;
+        let inside = |i: i64| 2 * i - 2 >= 0 && 2 * i + 3 < volume;
+        let low = (0..n).take_while(|&x| !inside(first + x as i64)).count();
+        let high = n - (low..n).rev().take_while(|&x| !inside(first + x as i64)).count();
+        let mut run = |from: usize, to: usize| {
+            let cells = Six {
+                mean: taps.map(|t| &split_m[t + from..t + to]),
+                variance: taps.map(|t| &split_v[t + from..t + to]),
+                weight: six_weights(first + from as i64, volume, [true; 6]),
+            };
+            let (m, v) = (&mut out_m[from..to], &mut out_v[from..to]);
+            if !pool(level, &cells, m, v) {
+                mend(&cells, |x| (first + (from + x) as i64, volume), m, v);
+            }
+        };
+        (0..low).for_each(|x| run(x, x + 1));
+        if low < high {
+            run(low, high);
+        }
+        (high..n).for_each(|x| run(x, x + 1));
+    }
+}
+
+/// Six rows of cells and their weights.
+struct Six<'a> {
+    mean: [&'a [f64]; 6],
+    variance: [&'a [f64]; 6],
+    weight: [f64; 6],
+}
+
+multiversion! {
+    /// Pools six rows; returns whether every result is finite. Relative to the third tap (cell 2i, which always exists), so
+    /// that constants stay what they are.
+    fn pool[](cells: &Six, mean: &mut [f64], variance: &mut [f64]) -> bool = pool_inner;
+}
+
+#[inline(always)]
+fn pool_inner(cells: &Six, mean: &mut [f64], variance: &mut [f64]) -> bool {
+    let n = mean.len();
+    let variance = &mut variance[..n];
+    let [m0, m1, m2, m3, m4, m5] = cells.mean.map(|m| &m[..n]);
+    let [v0, v1, v2, v3, v4, v5] = cells.variance.map(|v| &v[..n]);
+    let [w0, w1, w2, w3, w4, w5] = cells.weight;
+    for i in 0..n {
+        let p = m2[i];
+        let shift = (w0 * (m0[i] - p) + w1 * (m1[i] - p)) + w3 * (m3[i] - p) + (w4 * (m4[i] - p) + w5 * (m5[i] - p));
+        let m = p + shift;
+        let one = |w: f64, v: f64, x: f64| w * (v + (x - m) * (x - m));
+        mean[i] = m;
+        variance[i] = (one(w0, v0[i], m0[i]) + one(w1, v1[i], m1[i]))
+            + (one(w2, v2[i], p) + one(w3, v3[i], m3[i]))
+            + (one(w4, v4[i], m4[i]) + one(w5, v5[i], m5[i]));
+    }
+    variance.iter().fold(true, |all, v| all & v.is_finite())
+}
+
+/// Pools again, cell by cell, where a result is not finite: over valid cells only. `place` gives a cell's global index and
+/// the number of fine cells of the axis.
+fn mend(cells: &Six, place: impl Fn(usize) -> (i64, i64), mean: &mut [f64], variance: &mut [f64]) {
+    for x in 0..mean.len() {
+        if mean[x].is_finite() && variance[x].is_finite() {
+            continue;
+        }
+        let (i, n) = place(x);
+        // a NaN mean is a missing cell; a NaN variance beside a mean is what an infinity left
+        let weight = six_weights(i, n, cells.mean.map(|m| !m[x].is_nan()));
+        let taps = || (0..6).filter(|&k| weight[k] > 0.0).map(|k| (weight[k], cells.mean[k][x], cells.variance[k][x]));
+        let Some((_, pivot, _)) = taps().next() else {
+            (mean[x], variance[x]) = (f64::NAN, f64::NAN);
+            continue;
+        };
+        let mut m = pivot + taps().map(|(w, m, _)| w * (m - pivot)).sum::<f64>();
+        if !m.is_finite() {
+            m = taps().map(|(w, m, _)| w * m).sum();
+        }
+        mean[x] = m;
+        variance[x] = taps().map(|(w, t, v)| w * (v + (t - m) * (t - m))).sum();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::brick::Scratch;
+    use crate::grid::DType;
+    use crate::kernel::hostile::{SHAPES, calm, constant, volume};
+    use crate::kernel::simd::Level;
+
+    /// One axis of one step as section 4 has it: blur every cell, then pool pairs.
+    fn step_axis(level: &Moments, shape: Shape, axis: usize) -> (Moments, Shape) {
+        let pool = |cells: &[(f64, f64, f64)]| {
+            let valid: Vec<_> = cells.iter().filter(|c| !c.1.is_nan()).collect();
+            if valid.is_empty() {
+                return (f64::NAN, f64::NAN);
+            }
+            let total: f64 = valid.iter().map(|c| c.0).sum();
+            let mean = valid.iter().map(|c| c.0 * c.1).sum::<f64>() / total;
+            (mean, valid.iter().map(|c| c.0 * (c.2 + (c.1 - mean).powi(2))).sum::<f64>() / total)
+        };
+        let index = |p: [usize; 3], s: Shape| (p[0] * s[1] + p[1]) * s[2] + p[2];
+        let mut coarse = shape;
+        coarse[axis] = shape[axis].div_ceil(2);
+        let mut out = Moments::default();
+        for p in Region::whole(coarse).iter() {
+            let p = p.map(|i| i as usize);
+            let blurred = (0..2).filter(|j| 2 * p[axis] + j < shape[axis]).map(|j| {
+                let taps: Vec<_> = (0..5)
+                    .filter_map(|k| (2 * p[axis] + j + k).checked_sub(2).filter(|q| *q < shape[axis]).map(|q| (k, q)))
+                    .map(|(k, q)| {
+                        let mut from = p;
+                        from[axis] = q;
+                        let i = index(from, shape);
+                        ([1.0, 4.0, 6.0, 4.0, 1.0][k], level.mean[i], level.variance[i])
+                    })
+                    .collect();
+                let (m, v) = pool(&taps);
+                (1.0, m, v)
+            });
+            let (m, v) = pool(&blurred.collect::<Vec<_>>());
+            out.mean.push(m);
+            out.variance.push(v);
+        }
+        (out, coarse)
+    }
+
+    fn step(
+        fine: &Moments,
+        fine_box: Region,
+        volume: Shape,
+        halve: [bool; 3],
+        coarse: Region,
+        level: Level,
+    ) -> Moments {
+        let (mut dst, mut scratch) = (Moments::default(), Scratch::new());
+        coarsen(fine, fine_box, volume, halve, coarse, &mut dst, &mut Context { level, scratch: &mut scratch });
+        dst
+    }
+
+    /// The cells of `part`, cut out of a level.
+    fn part_of(level: &Moments, shape: Shape, part: Region) -> Moments {
+        let index = |p: [i64; 3]| (p[0] as usize * shape[1] + p[1] as usize) * shape[2] + p[2] as usize;
+        let pick = |v: &[f64]| part.iter().map(|p| v[index(p)]).collect();
+        Moments { mean: pick(&level.mean), variance: pick(&level.variance) }
+    }
+
+    #[test]
+    fn the_chain_equals_blurring_and_halving_for_every_box_and_level() {
+        let halvings = [[true; 3], [true, false, true], [false, true, false], [false, false, true]];
+        for (case, dtype) in [DType::U8, DType::F32, DType::F64].into_iter().enumerate() {
+            for (s, shape) in SHAPES.into_iter().enumerate() {
+                for halve in halvings {
+                    let v = if case == 1 { volume(dtype, shape, s as u64) } else { calm(dtype, shape, s as u64) };
+                    let mut fine = Moments::default();
+                    base(v.view(shape), Affine::new(-1.0, 3.0), Some(30), &mut fine);
+                    // infinities have a test of their own: pooling twice and at once differ in which NaN they leave
+                    fine.mean.iter_mut().for_each(|m| *m = if m.abs() > 1e20 { 7.0 } else { *m });
+                    let mut size = shape;
+                    for _ in 0..3 {
+                        let (mut expect, mut coarse) = (fine.clone(), size);
+                        for axis in (0..3).filter(|a| halve[*a]) {
+                            (expect, coarse) = step_axis(&expect, coarse, axis);
+                        }
+                        let whole = Region::whole(coarse);
+                        let got = step(&fine, Region::whole(size), size, halve, whole, Level::Baseline);
+                        for (i, (e, g)) in expect.mean.iter().zip(&got.mean).enumerate() {
+                            let (ev, gv) = (expect.variance[i], got.variance[i]);
+                            assert!((e - g).abs() <= 1e-12 * e.abs().max(100.0) || e.is_nan() && g.is_nan());
+                            assert!((ev - gv).abs() <= 1e-10 * ev.max(1.0) || ev.is_nan() && gv.is_nan(), "{ev} {gv}");
+                        }
+                        for level in Level::available() {
+                            for edge in [3, 1000] {
+                                for cell in whole.cells([0; 3], [edge; 3]).iter() {
+                                    let part = Region::of_cell(cell, [0; 3], [edge; 3]).clip(&whole);
+                                    let from = needed(part, halve, size).grow([1, 0, 1]).clip(&Region::whole(size));
+                                    let brick = part_of(&fine, size, from);
+                                    let cells = step(&brick, from, size, halve, part, level);
+                                    let bits = |m: &Moments| {
+                                        m.mean.iter().chain(&m.variance).map(|v| v.to_bits()).collect::<Vec<_>>()
+                                    };
+                                    assert_eq!(bits(&cells), bits(&part_of(&got, coarse, part)), "{shape:?} {level:?}");
+                                }
+                            }
+                        }
+                        (fine, size) = (got, coarse);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn constants_stay_and_infinities_stay_near() {
+        let shape = [5, 6, 40];
+        for (dtype, value) in
+            [(DType::F32, 0.1), (DType::F64, f64::MAX), (DType::U16, 65535.0), (DType::F64, 1.0 / 3.0)]
+        {
+            let v = constant(dtype, shape, value);
+            let mut fine = Moments::default();
+            base(v.view(shape), Affine::IDENTITY, None, &mut fine);
+            fine.mean[77] = f64::NAN;
+            fine.variance[77] = f64::NAN;
+            let got = step(&fine, Region::whole(shape), shape, [true; 3], Region::whole([3, 3, 20]), Level::detect());
+            assert!(
+                got.mean.iter().all(|m| *m == v.at(0)) && got.variance.iter().all(|v| *v == 0.0),
+                "{dtype} {value}"
+            );
+        }
+        let mut fine = Moments { mean: vec![1.0; 40], variance: vec![0.0; 40] };
+        fine.mean[20] = f64::INFINITY;
+        let got =
+            step(&fine, Region::whole([1, 1, 40]), [1, 1, 40], [true; 3], Region::whole([1, 1, 20]), Level::detect());
+        for i in 0..20 {
+            let reached = (9..=11).contains(&i); // cell i sees 2i - 2 ..= 2i + 3
+            let expect = if reached { f64::INFINITY } else { 1.0 };
+            assert_eq!(got.mean[i], expect, "cell {i}");
+            assert_eq!(got.variance[i].is_nan(), reached, "cell {i}");
+        }
+    }
 }
