@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use crate::grid::DType;
 use crate::store::Sink;
 
 /// Larger metadata is not read.
@@ -16,6 +17,9 @@ pub struct Attributes {
     pub occlude: Option<Value>,
     /// Datasets of the first multiscale, by path.
     pub datasets: Vec<String>,
+    /// Shape and element type of a flat output, which a headerless one cannot say itself.
+    pub shape: Option<[usize; 3]>,
+    pub dtype: Option<DType>,
 }
 
 /// Reads the metadata of a Zarr group or array (v3, then v2), or the file beside a flat output.
@@ -24,7 +28,7 @@ pub fn read(path: &Path) -> Attributes {
         let multiscale = attributes.pointer("/ome/multiscales/0").or_else(|| attributes.pointer("/multiscales/0"));
         let datasets = multiscale.and_then(|m| m.get("datasets")).and_then(Value::as_array);
         let names = datasets.into_iter().flatten().filter_map(|d| d.get("path")?.as_str().map(String::from));
-        Attributes { occlude: attributes.get("occlude").cloned(), datasets: names.collect() }
+        Attributes { occlude: attributes.get("occlude").cloned(), datasets: names.collect(), ..Attributes::default() }
     };
     if let Some(attributes) = json(&path.join("zarr.json")).as_ref().and_then(|v| v.get("attributes")) {
         return from_group(attributes);
@@ -32,10 +36,16 @@ pub fn read(path: &Path) -> Attributes {
     if let Some(attributes) = json(&path.join(".zattrs")) {
         return from_group(&attributes);
     }
-    let beside = json(&Sink::work_dir(path).join("meta.json"));
-    // The file holds the attribute itself, or a table with it.
-    let occlude = beside.map(|v| v.get("occlude").cloned().unwrap_or(v));
-    Attributes { occlude, datasets: Vec::new() }
+    let Some(beside) = json(&Sink::work_dir(path).join("meta.json")) else { return Attributes::default() };
+    let sizes = beside.get("shape").and_then(Value::as_array);
+    let sizes = sizes.and_then(|s| s.iter().map(|n| n.as_u64().map(|n| n as usize)).collect::<Option<Vec<_>>>());
+    Attributes {
+        shape: sizes.and_then(|s| s.try_into().ok()),
+        dtype: beside.get("dtype").and_then(Value::as_str).and_then(DType::parse),
+        // An unfinished output has no attribute yet, only the note that it is not complete.
+        occlude: beside.get("occlude").cloned().or(Some(beside)),
+        datasets: Vec::new(),
+    }
 }
 
 fn json(path: &Path) -> Option<Value> {
@@ -91,13 +101,15 @@ mod tests {
         put("a.zarr/zarr.json", &json!({"attributes": {"occlude": occlude, "ome": {"multiscales": multiscales}}}));
         put("b.zarr/.zattrs", &json!({"occlude": occlude, "multiscales": multiscales}));
         put("c.nii.occlude/meta.json", &occlude);
-        put("d.nii.occlude/meta.json", &json!({"occlude": occlude}));
+        put("d.nii.occlude/meta.json", &json!({"occlude": occlude, "shape": [1, 2, 3], "dtype": "u8"}));
         for (name, levels) in [("a.zarr", 2), ("b.zarr", 2), ("c.nii", 0), ("d.nii", 0)] {
             let a = read(&folder.path().join(name));
             assert_eq!(a.value_range(), Some([-1.0, 3.5]), "{name}");
             assert!(a.is_openness() && a.complete() == Some(true), "{name}");
             assert_eq!(a.datasets.len(), levels, "{name}");
         }
+        let d = read(&folder.path().join("d.nii"));
+        assert_eq!((d.shape, d.dtype), (Some([1, 2, 3]), Some(DType::U8)));
         put("e.zarr/zarr.json", &json!({"attributes": {"occlude": {"value_range": [3, 3], "channels": []}}}));
         let e = read(&folder.path().join("e.zarr"));
         assert_eq!((e.value_range(), e.is_openness(), e.complete()), (None, false, Some(false)));

@@ -59,9 +59,11 @@ fn warnings(info: &VolumeInfo, attributes: &Attributes) -> Vec<String> {
             human::number(most / least)
         ));
     }
-    if info.orientation.is_some() && info.origin == [0.0; 3] {
+    let oblique =
+        |m: &[[f64; 4]; 3]| (0..3).any(|r| (0..3).any(|c| if r == c { m[r][c] <= 0.0 } else { m[r][c] != 0.0 }));
+    if info.orientation.as_ref().is_some_and(|o| oblique(&o.matrix)) {
         found.push(
-            "the orientation is not axis-aligned; origin 0 is used and the matrix is kept in the attributes".into(),
+            "the direction matrix is not diagonal and positive: origin 0 is used, and the matrix is kept as orientation".into(),
         );
     }
     found

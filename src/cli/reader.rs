@@ -110,20 +110,23 @@ impl Volume {
 
 /// [`input`] of a path with what is known beside it.
 pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attributes) -> Result<Input> {
-    input(path, level, &describe(path, raw, attributes))
+    let raw = describe(path, raw, attributes);
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let stem = name.strip_suffix(".gz").unwrap_or(&name);
+    if raw.shape.is_none() && path.is_file() && (stem.ends_with(".raw") || stem.ends_with(".bin")) {
+        let message = format!("{} is headerless; expected --shape Z,Y,X and --dtype beside it", path.display());
+        return Err(usage("--shape", message));
+    }
+    input(path, level, &raw)
 }
 
 /// A headerless output of this program: shape and type stand in the file beside it.
 fn describe(path: &Path, given: &RawArgs, attributes: &Attributes) -> RawArgs {
     let raw_name = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("raw"));
-    let Some(occlude) = attributes.occlude.as_ref().filter(|_| raw_name && given.shape.is_none()) else {
-        return given.clone();
-    };
-    let sizes = occlude.get("shape").and_then(|s| s.as_array());
-    let sizes = sizes.map(|s| s.iter().filter_map(|n| n.as_u64()).map(|n| n as usize).collect::<Vec<_>>());
-    let dtype = occlude.get("dtype").and_then(|d| d.as_str()).and_then(DType::parse);
-    match (sizes.and_then(|s| <[usize; 3]>::try_from(s).ok()), given.dtype.or(dtype)) {
-        (Some(shape), Some(dtype)) => RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() },
+    match (attributes.shape, given.dtype.or(attributes.dtype)) {
+        (Some(shape), Some(dtype)) if raw_name && given.shape.is_none() => {
+            RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() }
+        }
         _ => given.clone(),
     }
 }

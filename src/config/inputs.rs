@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::keys::Section;
+use super::keys::{SYNTHETIC, Section};
 use super::section::Reader;
 use super::tree::Node;
 use super::{Input, InputKind, RawFormat, join_path, read};
@@ -52,7 +52,7 @@ fn synthetic(r: &Reader) -> Result<InputKind> {
         return Err(r.error("shape", "missing; a synthetic field needs shape = [z, y, x]"));
     }
     Ok(InputKind::Synthetic {
-        field: r.get("synthetic", |n| read::non_empty(n).map(String::from))?,
+        field: r.choice("synthetic", &SYNTHETIC.iter().map(|f| (*f, *f)).collect::<Vec<_>>())?.to_string(),
         shape: r.get("shape", read::shape)?,
         dtype: r.opt("dtype", read::dtype)?.unwrap_or(DType::U8),
         seed: r.int("seed")? as u64,

@@ -73,6 +73,9 @@ pub fn op_channels(op: &str) -> &'static [&'static str] {
 
 pub(super) const METHODS: &[&str] = &["exact", "cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal"];
 pub(super) const FORMATS: &[&str] = &["ome-zarr-0.5", "ome-zarr-0.4", "nrrd", "nii", "npy", "raw"];
+/// Fields that `synthetic` names; the store makes them.
+pub const SYNTHETIC: &[&str] = &["sphere", "plane", "gyroid", "noise", "ramp", "phantom", "constant"];
+
 const NO_OPS: &[&str] = &[];
 const WINDOWED: &[&str] = &["box", "gaussian", "ambient_occlusion"];
 const REGRESSION: &[&str] = &["gradient", "saliency"];
@@ -124,7 +127,7 @@ pub const KEYS: &[Key] = &[
     run("lanes", Kind::Choice(&["pure", "mixed"]), "\"pure\"", "mixed: bricks of one stage may go to CPU and GPU both, and bytes may then depend on which"),
     // [input.NAME]
     key(Input, "path", Kind::Path, Absent("synthetic is given instead"), "file or folder: raw, NRRD, NIfTI, MetaImage, TIFF, npy, Zarr, OME-Zarr"),
-    key(Input, "synthetic", Kind::Text, Absent("path is given instead"), "a field made on the fly instead of a file"),
+    key(Input, "synthetic", Kind::Choice(SYNTHETIC), Absent("path is given instead"), "a field made on the fly instead of a file"),
     key(Input, "format", Kind::Choice(&["auto", "raw"]), Toml("\"auto\""), "raw: headerless voxels, x fastest; auto: by the file's name and head"),
     key(Input, "shape", Kind::Shape, Absent("the file says it"), "raw and synthetic only: voxels"),
     key(Input, "dtype", Kind::DType, Absent("the file says it; u8 for synthetic"), "raw and synthetic only: element type"),
