@@ -1,7 +1,11 @@
 //! Counting by comparison: every voxel of a window against its centre, one vector of centres at a time. Along y, four output
 //! rows share each load.
 
+use std::ops::Range;
+
+use super::vector::{self, Block, Lanes};
 use super::{Counts, Key, MOST_LANES, Plan};
+use crate::kernel::simd::Level;
 use crate::multiversion;
 use crate::stage::Ties;
 
@@ -11,7 +15,7 @@ pub(super) const ROWS: usize = 4;
 /// Fills `counts` for up to [`MOST_LANES`] output voxels from `[z, y, x]` on in each of `rows` rows. `keys` and `valid` are
 /// the padded source; `valid` is given where voxels are missing.
 pub(super) fn count<K: Key, const L: usize>(
-    level: crate::kernel::simd::Level,
+    level: Level,
     keys: &[K],
     valid: Option<&[i8]>,
     plan: &Plan,
@@ -26,9 +30,9 @@ pub(super) fn count<K: Key, const L: usize>(
         }
         let mut totals = [[[0u32; L]; 2]; ROWS];
         if plan.ties == Ties::Mid {
-            compare_all(level, keys, None, plan, place, rows, &mut totals);
+            windows::<K, L, true>(level, keys, None, plan, place, rows, &mut totals);
         } else {
-            above_all(level, keys, None, plan, place, rows, &mut totals);
+            windows::<K, L, false>(level, keys, None, plan, place, rows, &mut totals);
         }
         for (counts, totals) in counts.iter_mut().zip(&totals) {
             counts.above[x..x + L].copy_from_slice(&totals[0]);
@@ -43,7 +47,7 @@ pub(super) fn count<K: Key, const L: usize>(
         }
         Some(valid) => {
             let mut totals = [[[0u32; MOST_LANES]; 2]; ROWS];
-            above_all(level, valid, Some(0), plan, place, rows, &mut totals);
+            windows::<i8, MOST_LANES, false>(level, valid, Some(0), plan, place, rows, &mut totals);
             counts.iter_mut().zip(&totals).for_each(|(c, t)| c.n = t[0]);
         }
     }
@@ -52,21 +56,9 @@ pub(super) fn count<K: Key, const L: usize>(
 /// Totals of one run: per row, keys above the centre and keys not below it.
 type Totals<const L: usize> = [[[u32; L]; 2]; ROWS];
 
-multiversion! {
-    fn above_all[K: Key, const L: usize](
-        keys: &[K], centre: Option<K>, plan: &Plan, place: [usize; 3], rows: usize, totals: &mut Totals<L>,
-    ) -> () = windows::<K, L, false>;
-}
-
-multiversion! {
-    fn compare_all[K: Key, const L: usize](
-        keys: &[K], centre: Option<K>, plan: &Plan, place: [usize; 3], rows: usize, totals: &mut Totals<L>,
-    ) -> () = windows::<K, L, true>;
-}
-
 /// Compares the windows about `L` voxels of each of `rows` output rows with their centres, or with `centre`.
-#[inline(always)]
 fn windows<K: Key, const L: usize, const MID: bool>(
+    level: Level,
     keys: &[K],
     centre: Option<K>,
     plan: &Plan,
@@ -75,136 +67,99 @@ fn windows<K: Key, const L: usize, const MID: bool>(
     totals: &mut Totals<L>,
 ) {
     let rx = plan.radius[2];
-    let row = |z: usize, y: usize| &keys[(z * plan.src[1] + y) * plan.width + x..][..L + 2 * rx];
+    let start = |z: usize, y: usize| (z * plan.src[1] + y) * plan.width + x;
     let centres: [[K; L]; ROWS] = std::array::from_fn(|j| match centre {
         Some(c) => [c; L],
-        None => row(plan.at[0] + z, plan.at[1] + y + j.min(rows - 1))[rx..rx + L].try_into().unwrap(),
+        None => {
+            let from = start(plan.at[0] + z, plan.at[1] + y + j.min(rows - 1)) + rx;
+            keys[from..from + L].try_into().unwrap()
+        }
     });
-    let bands: [_; ROWS] = std::array::from_fn(|j| plan.window(1, y + j.min(rows - 1)));
+    let bands: [_; ROWS] = std::array::from_fn(|j| {
+        let band = plan.window(1, y + j.min(rows - 1));
+        *band.start()..*band.end() + 1
+    });
     // rows of the source that all output rows see are loaded once for all
-    let shared =
-        if plan.reach.is_empty() && rows == ROWS { *bands[ROWS - 1].start()..*bands[0].end() + 1 } else { 0..0 };
-    let mut runs: [Run<K, L>; ROWS] = std::array::from_fn(|_| Run::default());
+    let mut shared = bands[0].end..bands[0].end;
+    if plan.reach.is_empty() && rows == ROWS && bands[ROWS - 1].start < bands[0].end {
+        shared.start = bands[ROWS - 1].start;
+    }
     for sz in plan.window(0, z) {
         let dz = sz as i64 - (plan.at[0] + z) as i64;
-        for sy in shared.clone() {
-            let row = row(sz, sy);
-            runs.iter_mut().zip(totals.iter_mut()).for_each(|(r, t)| r.make_room::<MID>(2 * rx + 1, t));
-            compare_rows::<K, L, MID>(row, &centres, &mut runs, totals);
+        let block = |ys: &Range<usize>, reach: usize| Block {
+            keys: &keys[start(sz, ys.start) + rx - reach..],
+            stride: plan.width,
+            rows: ys.len(),
+            shifts: 2 * reach + 1,
+        };
+        if !shared.is_empty() {
+            count_block::<K, L, ROWS, MID>(level, block(&shared, rx), &centres, totals);
         }
         for j in 0..rows {
-            for sy in bands[j].clone().filter(|sy| !shared.contains(sy)) {
+            let (centre, total) = (std::array::from_ref(&centres[j]), std::array::from_mut(&mut totals[j]));
+            if plan.reach.is_empty() {
+                for ys in [bands[j].start..shared.start.min(bands[j].end), shared.end.max(bands[j].start)..bands[j].end]
+                {
+                    if !ys.is_empty() {
+                        count_block::<K, L, 1, MID>(level, block(&ys, rx), centre, total);
+                    }
+                }
+                continue;
+            }
+            for sy in bands[j].clone() {
                 let dy = sy as i64 - (plan.at[1] + y + j) as i64;
-                let Some(reach) = plan.reach(dz, dy) else { continue };
-                let part = &row(sz, sy)[rx - reach..][..L + 2 * reach];
-                runs[j].make_room::<MID>(2 * reach + 1, &mut totals[j]);
-                compare_row::<K, L, MID>(part, &centres[j], &mut runs[j], &mut totals[j]);
-            }
-        }
-    }
-    runs.iter_mut().zip(totals.iter_mut()).for_each(|(r, t)| r.flush::<MID>(t));
-}
-
-/// Counts in lanes as narrow as the keys, emptied into totals before they overflow.
-struct Run<K: Key, const L: usize> {
-    above: [K::Count; L],
-    not_below: [K::Count; L],
-    used: usize,
-}
-
-impl<K: Key, const L: usize> Default for Run<K, L> {
-    #[inline(always)]
-    fn default() -> Self {
-        Run { above: [Default::default(); L], not_below: [Default::default(); L], used: 0 }
-    }
-}
-
-impl<K: Key, const L: usize> Run<K, L> {
-    #[inline(always)]
-    fn flush<const MID: bool>(&mut self, totals: &mut [[u32; L]; 2]) {
-        for l in 0..L {
-            let count: u64 = self.above[l].into();
-            totals[0][l] += count as u32;
-            if MID {
-                let count: u64 = self.not_below[l].into();
-                totals[1][l] += count as u32;
-            }
-        }
-        *self = Run::default();
-    }
-
-    /// Makes room for `n` more comparisons, or as many as fit.
-    #[inline(always)]
-    fn make_room<const MID: bool>(&mut self, n: usize, totals: &mut [[u32; L]; 2]) {
-        if self.used + n > K::MOST {
-            self.flush::<MID>(totals);
-        }
-        self.used += n;
-    }
-}
-
-/// Compares each of the `row.len() - L + 1` vectors of a row with the centres of all output rows.
-#[inline(always)]
-fn compare_rows<K: Key, const L: usize, const MID: bool>(
-    row: &[K],
-    centres: &[[K; L]; ROWS],
-    runs: &mut [Run<K, L>; ROWS],
-    totals: &mut Totals<L>,
-) {
-    if row.len() - L + 1 > K::MOST {
-        for j in 0..ROWS {
-            compare_row::<K, L, MID>(row, &centres[j], &mut runs[j], &mut totals[j]);
-        }
-        return;
-    }
-    let mut above: [[K::Count; L]; ROWS] = std::array::from_fn(|j| runs[j].above);
-    let mut not_below: [[K::Count; L]; ROWS] = std::array::from_fn(|j| runs[j].not_below);
-    for v in row.windows(L) {
-        let v: &[K; L] = v.try_into().unwrap();
-        for j in 0..ROWS {
-            for l in 0..L {
-                above[j][l] += K::Count::from(v[l] > centres[j][l]);
-            }
-            if MID {
-                for l in 0..L {
-                    not_below[j][l] += K::Count::from(v[l] >= centres[j][l]);
+                if let Some(reach) = plan.reach(dz, dy) {
+                    count_block::<K, L, 1, MID>(level, block(&(sy..sy + 1), reach), centre, total);
                 }
             }
         }
     }
-    for j in 0..ROWS {
-        runs[j].above = above[j];
-        runs[j].not_below = not_below[j];
+}
+
+/// Counts a block in parts that narrow counters hold, and adds them to the totals.
+#[inline(always)]
+fn count_block<K: Key, const L: usize, const R: usize, const MID: bool>(
+    level: Level,
+    block: Block<K>,
+    centres: &[[K; L]; R],
+    totals: &mut [[[u32; L]; 2]; R],
+) {
+    let rows = (K::MOST / block.shifts).max(1);
+    for first in (0..block.rows).step_by(rows) {
+        for shift in (0..block.shifts).step_by(K::MOST) {
+            let part = Block {
+                keys: &block.keys[first * block.stride + shift..],
+                rows: rows.min(block.rows - first),
+                shifts: K::MOST.min(block.shifts - shift),
+                ..block
+            };
+            let (mut above, mut not_below) = ([[K::Count::default(); L]; R], [[K::Count::default(); L]; R]);
+            let lanes = Lanes { above: &mut above, not_below: &mut not_below };
+            vector::compare::<K, L, R, MID>(level, part, centres, lanes);
+            add_counts(level, &above, 0, totals);
+            if MID {
+                add_counts(level, &not_below, 1, totals);
+            }
+        }
     }
 }
 
-/// As [`compare_rows`] for one output row, of any length.
+multiversion! {
+    fn add_counts[C: Copy + Into<u64>, const L: usize, const R: usize](
+        counts: &[[C; L]; R], which: usize, totals: &mut [[[u32; L]; 2]; R],
+    ) -> () = add_counts_inner;
+}
+
 #[inline(always)]
-fn compare_row<K: Key, const L: usize, const MID: bool>(
-    row: &[K],
-    centre: &[K; L],
-    run: &mut Run<K, L>,
-    totals: &mut [[u32; L]; 2],
+fn add_counts_inner<C: Copy + Into<u64>, const L: usize, const R: usize>(
+    counts: &[[C; L]; R],
+    which: usize,
+    totals: &mut [[[u32; L]; 2]; R],
 ) {
-    let n = row.len() - L + 1;
-    for first in (0..n).step_by(K::MOST) {
-        if first > 0 || n > K::MOST {
-            run.flush::<MID>(totals);
-            run.used = K::MOST;
+    for (total, counts) in totals.iter_mut().zip(counts) {
+        for (t, c) in total[which].iter_mut().zip(counts) {
+            let c: u64 = (*c).into();
+            *t += c as u32;
         }
-        let (mut above, mut not_below) = (run.above, run.not_below);
-        for v in row[first..(first + K::MOST + L - 1).min(row.len())].windows(L) {
-            let v: &[K; L] = v.try_into().unwrap();
-            for l in 0..L {
-                above[l] += K::Count::from(v[l] > centre[l]);
-            }
-            if MID {
-                for l in 0..L {
-                    not_below[l] += K::Count::from(v[l] >= centre[l]);
-                }
-            }
-        }
-        run.above = above;
-        run.not_below = not_below;
     }
 }

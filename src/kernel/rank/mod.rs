@@ -6,6 +6,7 @@
 //! counted in integers, so nothing depends on brick, order or instruction set.
 
 mod compare;
+mod vector;
 
 use super::Context;
 use super::values::missing_as;
@@ -159,7 +160,7 @@ fn ball(radius: [usize; 3], clipped: [usize; 3]) -> Vec<Option<u32>> {
 }
 
 /// What voxels are compared as. `LEAST` is no larger than any key.
-pub(crate) trait Key: Voxel {
+pub(crate) trait Key: Voxel + vector::Vector {
     const LEAST: Self;
     /// As wide as the key, so that a comparison's result needs no widening.
     type Count: Copy + Default + std::ops::AddAssign + From<bool> + Into<u64>;
