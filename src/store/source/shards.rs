@@ -164,6 +164,7 @@ mod tests {
         // A zstd frame of one segment with a 4-byte content size of 3 GiB.
         let mut zstd = vec![0x28, 0xB5, 0x2F, 0xFD, 0xA0];
         zstd.extend((3u32 << 30).to_le_bytes());
+        zstd.extend([0; 4]); // where the checksum would be
         assert!(check_declared(&zstd, 4096, &["bytes".into(), "zstd".into(), "crc32c".into()]).is_err());
     }
 

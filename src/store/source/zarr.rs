@@ -173,7 +173,8 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
 
 /// Opens a Zarr array or an OME-Zarr image.
 pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
-    let (folder, meta, multiscale) = find(input, path)?;
+    let (folder, mut meta, multiscale) = find(input, path)?;
+    meta.text.extend(format!("{multiscale:?}").bytes()); // placement is part of the identity
     let kinds = lead_axes(&folder, &meta, multiscale.as_ref())?;
     let (lead, n) = (kinds.len(), meta.shape.len());
     let tail = |list: &[u64]| -> [u64; 3] {
