@@ -387,6 +387,67 @@ fn formats_are_found_by_their_first_bytes_and_unknown_ones_listed() {
     assert_eq!(Source::open(&input).unwrap_err().exit_code(), 2);
 }
 
+/// More slices than files that are held open, in natural order; one that changes is noticed.
+#[test]
+fn many_slices_are_mapped_one_by_one() {
+    let folder = tempfile::tempdir().unwrap();
+    for i in 0..20 {
+        fs::copy(data(&format!("tiff/slices/s{}.tif", 8 + i % 4)), folder.path().join(format!("img{i}.tiff"))).unwrap();
+    }
+    fs::write(folder.path().join("notes.txt"), "not a slice").unwrap();
+    let (source, voxels) = whole(&file_input(folder.path()), 0).unwrap();
+    assert_eq!(source.info().shape, [20, 5, 6]);
+    assert!((0..600).all(|i| voxels.at(i) == expected([4, 5, 6], 0)(i % 120)));
+    fs::write(folder.path().join("img3.tiff"), b"II").unwrap();
+    let mut out = Voxels::zeroed(DType::F32, 30);
+    let e = source.read(0, Region::new([3, 0, 0], [4, 5, 6]), out.view_mut([1, 5, 6])).unwrap_err().to_string();
+    assert!(e.contains("img3.tiff: changed from"), "{e}");
+    fs::copy(data("tiff/strips.tif"), folder.path().join("img3.tiff")).unwrap();
+    assert!(Source::open(&file_input(folder.path())).unwrap_err().to_string().contains("one page per file"));
+}
+
+#[test]
+fn released_planes_come_back_unchanged() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("v.raw");
+    fs::write(&path, (0..1 << 22).map(|i: u32| (i.wrapping_mul(2654435761) >> 24) as u8).collect::<Vec<_>>()).unwrap();
+    let shape = [64, 256, 256];
+    let raw = RawFormat { shape, dtype: DType::U8, big_endian: false, offset: 0, trailing_ignore: false };
+    let source = Source::open(&raw_input(&path, raw)).unwrap();
+    let read = || {
+        let mut out = Voxels::zeroed(DType::U8, 1 << 22);
+        source.read(0, Region::whole(shape), out.view_mut(shape)).unwrap();
+        out
+    };
+    let before = read();
+    for region in [
+        Region::new([3, 0, 0], [40, 256, 256]),
+        Region::new([-9, -9, -9], [99, 999, 999]),
+        Region::new([5, 1, 0], [9, 9, 9]),
+    ] {
+        source.release(region);
+        assert_eq!(read(), before);
+    }
+}
+
+#[test]
+fn sources_are_shared_between_threads() {
+    fn shared<T: Send + Sync>(_: &T) {}
+    let source = Source::open(&fixture("zarr/ome05")).unwrap();
+    shared(&source);
+    std::thread::scope(|scope| {
+        for _ in 0..4 {
+            scope.spawn(|| {
+                for region in [Region::whole([4, 5, 6]), Region::new([1, 1, 1], [3, 4, 6])] {
+                    let mut out = Voxels::zeroed(DType::U16, region.voxels());
+                    source.read(0, region, out.view_mut(region.shape())).unwrap();
+                    assert_eq!(out.at(0), (region.lo[0] * 40 + region.lo[1] * 7 + region.lo[2]) as f64);
+                }
+            });
+        }
+    });
+}
+
 #[test]
 fn an_identity_follows_the_content_not_the_place() {
     let folder = tempfile::tempdir().unwrap();

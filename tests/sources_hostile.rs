@@ -401,5 +401,5 @@ fn corrupt_chunks_are_named() {
     fs::write(root.join("0.0.0"), gzip(&vec![0; 8 << 20])).unwrap();
     let mut chunk = Voxels::zeroed(DType::I16, 24);
     let e = Source::open(&file_input(&root)).unwrap().read_chunk(0, [0; 3], &mut chunk).unwrap_err().to_string();
-    assert!(e.contains("the metadata say 48"), "{e}");
+    assert!(e.contains("more than the 48 bytes that the metadata say"), "{e}");
 }

@@ -56,16 +56,23 @@ impl Lattice {
         rows.checked_add(self.step.checked_mul(x.checked_sub(1)?)?)?.checked_add(self.dtype.size() as u64)
     }
 
-    /// Bytes that file `index` must have. `None` where that overflows.
-    pub fn end(&self, index: usize) -> Option<u64> {
-        let last = match &self.planes {
+    /// Bytes that each of `files` files must have; 0 for one without voxels. `None` where that overflows.
+    pub fn ends(&self, files: usize) -> Option<Vec<u64>> {
+        let span = self.plane_span()?;
+        let mut ends = vec![0; files];
+        let mut claim = |file: usize, start: u64| -> Option<()> {
+            let end = ends.get_mut(file)?;
+            *end = start.checked_add(span)?.max(*end);
+            Some(())
+        };
+        match &self.planes {
             Planes::Even { bases, plane } => {
                 let last = plane.checked_mul(self.shape[0].checked_sub(1)? as u64)?;
-                bases.iter().max()?.checked_add(last)?
+                claim(0, bases.iter().max()?.checked_add(last)?)?;
             }
-            Planes::Table(table) => table.iter().filter(|(file, _)| *file as usize == index).map(|p| p.1).max()?,
-        };
-        last.checked_add(self.plane_span()?)
+            Planes::Table(table) => table.iter().try_for_each(|(file, start)| claim(*file as usize, *start))?,
+        }
+        Some(ends)
     }
 
     /// Copies the box into `dst`, which has its shape and the lattice's type. Returns the bytes taken.

@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 use super::VolumeInfo;
 use crate::brick::Voxels;
 use crate::config::{Input, InputKind};
-use crate::grid::{Affine, AnyViewMut, Region, Shape, ViewMut};
+use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, ViewMut};
 use crate::kernel::simd::Level;
 use crate::{Error, Result};
 use detect::Format;
@@ -150,8 +150,12 @@ impl Source {
         };
         let mut read = array.read_chunk(component, chunk, dst)?;
         if let Some(nodata) = self.info.nodata.filter(|_| self.info.dtype.is_float()) {
+            let same = |fill: f64| match self.info.dtype {
+                DType::F32 => fill as f32 == nodata as f32,
+                _ => fill == nodata,
+            };
             match &mut read {
-                ChunkRead::Missing(fill) if *fill == nodata => *fill = f64::NAN,
+                ChunkRead::Missing(fill) if same(*fill) => *fill = f64::NAN,
                 ChunkRead::Missing(_) => {}
                 ChunkRead::Data { .. } => lattice::mark_missing(&mut dst.view_mut(shape), nodata),
             }

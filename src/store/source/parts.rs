@@ -85,7 +85,7 @@ impl Layout {
         let [plane, row, step] = self.strides;
         let bases = self.bases.iter().map(|b| b.checked_add(base)).collect::<Option<_>>()?;
         let lattice = Lattice { shape, dtype, big_endian, planes: Planes::Even { bases, plane }, row, step };
-        lattice.end(0).map(|_| lattice)
+        lattice.ends(1).map(|_| lattice)
     }
 }
 

@@ -82,7 +82,7 @@ impl Planar {
             Pending::Reblock(reblock) => reblock.run(&self.paths, scratch, progress)?,
         };
         let mapped = MappedFile::of(scratch, file)?;
-        let need = self.lattice.end(0).unwrap_or(u64::MAX);
+        let need = self.lattice.ends(1).map_or(u64::MAX, |e| e[0]);
         if mapped.len() < need {
             let text = format!("the scratch file has {} bytes, {need} are needed", mapped.len());
             return Err(Error::file(scratch, text));
@@ -135,8 +135,10 @@ impl Planar {
 }
 
 fn open_all(info: &VolumeInfo, lattice: &Lattice, paths: &[PathBuf], exact: bool) -> Result<Files> {
+    let first = paths.first().map_or(Path::new(""), |p| p);
+    let ends = lattice.ends(paths.len()).ok_or_else(|| Error::file(first, "the sizes in the header overflow"))?;
     let check = |index: usize, path: &Path, len: u64| -> Result<()> {
-        let Some(need) = lattice.end(index) else { return Ok(()) };
+        let need = ends[index];
         let what = || format!("shape {:?} of {} ends at byte {need}", info.shape, info.dtype);
         if len < need {
             return Err(Error::file(

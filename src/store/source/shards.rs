@@ -118,16 +118,10 @@ pub fn check_declared(bytes: &[u8], want: u64, codecs: &[String]) -> Result<(), 
     let declared = match codec {
         "blosc" => body.get(4..8).and_then(|b| b.first_chunk()).map(|b| u32::from_le_bytes(*b) as u64),
         "zstd" => zstd_size(body),
-        // The last four bytes hold the size modulo 2^32; a stream that holds far more than it says fails later.
-        "gzip" => {
-            body.len().checked_sub(4).and_then(|at| body[at..].first_chunk()).map(|b| u32::from_le_bytes(*b) as u64)
-        }
         _ => None,
     };
     match declared {
-        Some(n) if n != want & if codec == "zstd" { u64::MAX } else { u32::MAX as u64 } => {
-            Err(format!("it says that it expands to {n} bytes, the metadata say {want}"))
-        }
+        Some(n) if n != want => Err(format!("it says that it expands to {n} bytes, the metadata say {want}")),
         _ => Ok(()),
     }
 }
@@ -170,6 +164,7 @@ mod tests {
         // A zstd frame of one segment with a 4-byte content size of 3 GiB.
         let mut zstd = vec![0x28, 0xB5, 0x2F, 0xFD, 0xA0];
         zstd.extend((3u32 << 30).to_le_bytes());
+        zstd.extend([0; 4]); // where the checksum would be
         assert!(check_declared(&zstd, 4096, &["bytes".into(), "zstd".into(), "crc32c".into()]).is_err());
     }
 

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use flate2::read::{MultiGzDecoder, ZlibDecoder};
+use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 
 use super::bytes;
 use crate::{Error, Result};
@@ -35,6 +35,29 @@ pub struct Packed {
 pub type Progress<'a> = &'a dyn Fn(u64) -> bool;
 
 const BLOCK: usize = 1 << 20;
+
+impl Packing {
+    pub fn name(self) -> &'static str {
+        match self {
+            Packing::Gzip => "gzip",
+            Packing::Zlib => "zlib",
+        }
+    }
+
+    /// Unpacks bytes in memory that should expand to `want` bytes, and no more than a byte beyond that.
+    pub fn unpack(self, packed: &[u8], want: u64) -> Result<Vec<u8>, String> {
+        let mut out = Vec::new();
+        let read = match self {
+            Packing::Gzip => MultiGzDecoder::new(packed).take(want + 1).read_to_end(&mut out),
+            Packing::Zlib => ZlibDecoder::new(packed).take(want + 1).read_to_end(&mut out),
+        };
+        read.map_err(|e| format!("the {} data are broken: {e}", self.name()))?;
+        if out.len() as u64 > want {
+            return Err(format!("the {} data expand to more than the {want} bytes that the metadata say", self.name()));
+        }
+        Ok(out)
+    }
+}
 
 impl Packed {
     /// A reader of the unpacked stream from its start.
@@ -92,7 +115,8 @@ impl Packed {
                 // A cut-off stream: what came before it is the useful number.
                 Err(e) => {
                     let at = self.skip + done;
-                    let text = format!("the {} data are broken or cut off after about {at} bytes: {e}", self.name());
+                    let text =
+                        format!("the {} data are broken or cut off after about {at} bytes: {e}", self.packing.name());
                     return Err(Error::file(&self.path, text));
                 }
             };
@@ -107,16 +131,12 @@ impl Packed {
         Ok(done)
     }
 
-    fn name(&self) -> &'static str {
-        match self.packing {
-            Packing::Gzip => "gzip",
-            Packing::Zlib => "zlib",
-        }
-    }
-
     fn wrong_len(&self, found: String) -> Error {
         let want = self.skip + self.len;
-        Error::file(&self.path, format!("the {} data expand to {found} bytes, but the header says {want}", self.name()))
+        Error::file(
+            &self.path,
+            format!("the {} data expand to {found} bytes, but the header says {want}", self.packing.name()),
+        )
     }
 }
 
@@ -145,4 +165,29 @@ pub fn nameless(scratch: &Path, len: u64) -> Result<File> {
         }
     }
     Err(Error::file(scratch, "no free name for a scratch file"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_disk_without_room_is_named_with_what_is_missing() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = nameless(folder.path(), 1 << 60).unwrap_err().to_string();
+        assert!(text.contains("needs 1152921504606846976") && text.contains("more); set run.scratch"), "{text}");
+        nameless(folder.path(), 1).unwrap().write_all(b"x").unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn unpacking_in_memory_is_bounded() {
+        let mut writer = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        writer.write_all(&[7; 1000]).unwrap();
+        let packed = writer.finish().unwrap();
+        assert_eq!(Packing::Gzip.unpack(&packed, 1000).unwrap(), [7; 1000]);
+        assert!(Packing::Gzip.unpack(&packed, 999).unwrap_err().contains("999"));
+        assert!(Packing::Zlib.unpack(&packed, 1000).is_err());
+        assert!(Packing::Gzip.unpack(&packed[..packed.len() / 2], 1000).is_err());
+    }
 }

@@ -338,7 +338,7 @@ fn place(
     if let Planes::Even { bases, .. } = &mut lattice.planes {
         *bases = (0..pairs.len() as u64).map(|c| c.checked_mul(one)).collect::<Option<_>>().ok_or_else(overflow)?;
     }
-    lattice.end(0).ok_or_else(overflow)?;
+    lattice.ends(1).ok_or_else(overflow)?;
     if form.white_is_zero && !matches!(form.dtype, DType::U8 | DType::U16 | DType::U32) {
         return Err(refuse(path, &format!("{} with white as zero, compressed or tiled", form.dtype)));
     }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use zarrs::array::codec::CodecChain;
-use zarrs::array::{Array, ArrayBytes, ArrayToBytesCodecTraits, CodecOptions};
+use zarrs::array::{Array, ArrayBytes, ArrayMetadata, ArrayToBytesCodecTraits, CodecOptions};
 use zarrs::filesystem::FilesystemStore;
 
 use super::ChunkRead;
@@ -173,7 +173,8 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
 
 /// Opens a Zarr array or an OME-Zarr image.
 pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
-    let (folder, meta, multiscale) = find(input, path)?;
+    let (folder, mut meta, multiscale) = find(input, path)?;
+    meta.text.extend(format!("{multiscale:?}").bytes()); // placement is part of the identity
     let kinds = lead_axes(&folder, &meta, multiscale.as_ref())?;
     let (lead, n) = (kinds.len(), meta.shape.len());
     let tail = |list: &[u64]| -> [u64; 3] {
@@ -219,7 +220,11 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
 
     let failed = |e: String| Error::file(&folder, format!("the Zarr array cannot be read: {e}"));
     let store = FilesystemStore::new(&folder).map_err(|e| failed(e.to_string()))?;
-    let array = guarded(|| Array::open(Arc::new(store), "/").map_err(|e| e.to_string())).map_err(failed)?;
+    let array = guarded(|| {
+        let metadata: ArrayMetadata = serde_json::from_value(meta.value.clone()).map_err(|e| e.to_string())?;
+        Array::new_with_metadata(Arc::new(store), "/", metadata).map_err(|e| e.to_string())
+    })
+    .map_err(failed)?;
     let codecs = match &meta.shard {
         None => array.codecs(),
         Some(shard) => {
@@ -286,7 +291,17 @@ impl ZarrArray {
         let corrupt = |e: String| Error::file(&path, format!("chunk {index:?} cannot be decoded: {e}"));
         let size = self.meta.dtype.size() as u64;
         let want = self.meta.inner.iter().product::<u64>() * size;
-        super::shards::check_declared(&bytes, want, &self.meta.byte_codecs).map_err(corrupt)?;
+        let bytes = match self.meta.inflate {
+            // Other codecs may still be inside, which make their own size.
+            Some(packing) => {
+                let most = if self.meta.byte_codecs.len() > 2 { self.most_encoded() } else { want };
+                packing.unpack(&bytes, most).map_err(corrupt)?
+            }
+            None => {
+                super::shards::check_declared(&bytes, want, &self.meta.byte_codecs).map_err(corrupt)?;
+                bytes
+            }
+        };
         let decoded = guarded(|| {
             let (kind, fill) = (self.array.data_type(), self.array.fill_value());
             self.codecs.decode(Cow::Owned(bytes), &self.inner, kind, fill, &self.options).map_err(|e| e.to_string())

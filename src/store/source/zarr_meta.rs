@@ -7,6 +7,7 @@ use serde_json::Value;
 use super::bytes;
 use super::planar::key;
 use super::raw::{numpy_type, refuse};
+use super::spool::Packing;
 use super::units;
 use crate::config::Input;
 use crate::grid::DType;
@@ -31,7 +32,11 @@ pub struct ArrayMeta {
     pub shard: Option<ShardMeta>,
     /// Names of the codecs that turn bytes to bytes in an inner chunk, the first applied first when written.
     pub byte_codecs: Vec<String>,
+    /// The outermost of them where it is gzip or zlib, which are unpacked here, with a bound; `value` lacks it.
+    pub inflate: Option<Packing>,
     pub names: Vec<Option<String>>,
+    /// The metadata, without that codec.
+    pub value: Value,
     /// The metadata file's text.
     pub text: Vec<u8>,
 }
@@ -105,7 +110,23 @@ pub fn array(folder: &Path) -> Result<Option<ArrayMeta>> {
     }
 }
 
-fn array_v3(path: &Path, value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
+/// Takes the last codec off a list if it is gzip or zlib.
+fn take_inflate(codecs: &mut Value) -> Option<Packing> {
+    let list = codecs.as_array_mut()?;
+    let packing = packing(codec_name(list.last()?))?;
+    list.pop();
+    Some(packing)
+}
+
+fn packing(name: &str) -> Option<Packing> {
+    match name {
+        "gzip" => Some(Packing::Gzip),
+        "zlib" | "numcodecs.zlib" => Some(Packing::Zlib),
+        _ => None,
+    }
+}
+
+fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
     let broken = |text: String| Error::file(path, format!("broken Zarr metadata: {text}"));
     let shape = sizes(path, "shape", &value["shape"], None, 1)?;
     let axes = Some(shape.len());
@@ -124,6 +145,8 @@ fn array_v3(path: &Path, value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
         inner: outer.clone(),
         shard: None,
         byte_codecs: names(list),
+        inflate: None,
+        value: Value::Null,
         shape,
         dtype,
         outer,
@@ -153,13 +176,18 @@ fn array_v3(path: &Path, value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
             Some(other) => return Err(broken(format!("index_location {other}; start or end are expected"))),
         };
         meta.byte_codecs = names(config["codecs"].as_array().ok_or_else(|| broken("a shard without codecs".into()))?);
-        meta.shard = Some(ShardMeta { codecs: config["codecs"].clone(), index_at_end, index_crc, grid });
+        let inner = &mut value["codecs"][0]["configuration"]["codecs"];
+        meta.inflate = take_inflate(inner);
+        meta.shard = Some(ShardMeta { codecs: inner.clone(), index_at_end, index_crc, grid });
+    } else {
+        meta.inflate = take_inflate(&mut value["codecs"]);
     }
     check_chunk(path, &meta)?;
+    meta.value = value;
     Ok(meta)
 }
 
-fn array_v2(path: &Path, value: Value, attributes: Value, text: Vec<u8>) -> Result<ArrayMeta> {
+fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> Result<ArrayMeta> {
     if value["zarr_format"].as_u64() != Some(2) {
         return Err(Error::file(path, format!("zarr_format is {}; 2 is expected in .zarray", value["zarr_format"])));
     }
@@ -167,12 +195,19 @@ fn array_v2(path: &Path, value: Value, attributes: Value, text: Vec<u8>) -> Resu
     let outer = sizes(path, "chunks", &value["chunks"], Some(shape.len()), 1)?;
     let descr = value["dtype"].as_str().ok_or_else(|| refuse(path, "a structured type"))?;
     let dtype = numpy_type(path, descr)?.1;
+    let byte_codecs: Vec<String> = value["compressor"]["id"].as_str().map(str::to_string).into_iter().collect();
+    let inflate = byte_codecs.first().and_then(|id| packing(id));
+    if inflate.is_some() {
+        value["compressor"] = Value::Null;
+    }
     let meta = ArrayMeta {
         version: 2,
         names: dimension_names(&attributes["_ARRAY_DIMENSIONS"], shape.len()),
         inner: outer.clone(),
         shard: None,
-        byte_codecs: value["compressor"]["id"].as_str().map(str::to_string).into_iter().collect(),
+        byte_codecs,
+        inflate,
+        value,
         shape,
         dtype,
         outer,
