@@ -41,7 +41,8 @@ pub struct Cells {
     pub between: Vec<f64>,
 }
 
-/// Level-0 voxels of a box that starts at a cell boundary.
+/// Level-0 voxels of a box that starts at a cell boundary and ends at one or at the end of the volume, also for every level
+/// made from it.
 #[derive(Clone, Copy)]
 pub struct Level0<'a> {
     pub value: AnyView<'a>,

@@ -9,7 +9,7 @@ use crate::config::OutputFormat;
 use crate::grid::DType;
 
 /// Room for what only the end of a run knows (the hash of the configuration), bytes.
-const NRRD_RESERVE: usize = 512;
+const NRRD_RESERVE: usize = 128;
 
 /// The header of a flat file; `occlude` once the run is done. Its length depends on `spec` alone.
 pub fn header(spec: &SinkSpec, occlude: Option<&Value>) -> Vec<u8> {

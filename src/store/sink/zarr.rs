@@ -23,7 +23,7 @@ use crate::{Error, Result};
 const OPEN_FILES: usize = 64;
 
 /// Files that are synced together when many are committed.
-const COMMIT_BATCH: usize = 256;
+const COMMIT_BATCH: usize = 64;
 
 /// Offset and length of a chunk that is not stored.
 const MISSING: [u64; 2] = [u64::MAX; 2];
