@@ -4,9 +4,10 @@
 //! one copy of a sheet into the first-level cache serves both senses, and a step along 64 lines is one row. Directions
 //! dominated by x run on a copy with x and z exchanged.
 
+use super::contribute;
 use super::keys::{Key, LANES, Volume};
 use super::lines::{Family, displacement};
-use super::scan::{self, Hit};
+use super::scan::{self, Hit, Sheet};
 use super::sinks::{Piece, Sink, Visit};
 use crate::grid::Region;
 use crate::kernel::simd::Level;
@@ -27,6 +28,8 @@ pub(super) struct Buffers<'a, K> {
     pub hits: [&'a mut [u32]; 2],
     /// One entry per plane of a sheet.
     pub stack: &'a mut [u32],
+    /// Where the planes of a sheet stand.
+    pub starts: &'a mut [usize],
     /// For the AVX-512 search.
     pub turned: &'a mut [u8],
     /// One entry per plane of the source.
@@ -55,7 +58,7 @@ pub(super) fn sweep_family<K: Key, S: Sink>(
     let axis = usize::from(family.axis == 1);
     let planes = volume.region.shape()[axis];
     let origin = volume.region.lo[axis];
-    let Buffers { sheet, hits, stack, turned, shifts, tables } = buffers;
+    let Buffers { sheet, hits, stack, starts, turned, shifts, tables } = buffers;
     for (shift, slope) in shifts.iter_mut().zip([family.slope[perm[1 - axis]], family.slope[perm[2]]]) {
         for (i, s) in shift[..planes].iter_mut().enumerate() {
             *s = displacement(slope, origin + i as i64) as i32;
@@ -67,7 +70,10 @@ pub(super) fn sweep_family<K: Key, S: Sink>(
             table[reach] = sense.table[family.reach];
         }
     }
+    let mut bytes = [[[0; 256]; 3]; 2];
+    contribute::split([&tables[0][..=reach], &tables[1][..=reach]], &mut bytes);
     let visit = Visit {
+        bytes: &bytes,
         family,
         perm,
         reach,
@@ -75,12 +81,13 @@ pub(super) fn sweep_family<K: Key, S: Sink>(
         shifts: [&shifts[0][..planes], &shifts[1][..planes]],
         origin,
     };
+    let mut room = Room { rows: sheet, stack, starts, turned };
     let job = Job { volume, tile: in_frame(tile, perm), axis, visit };
     let [forward, backward] = hits;
     if reach <= u8::MAX as usize {
-        run::<K, u8, S>(level, &job, sheet, [bytes_of(forward), bytes_of(backward)], stack, turned, sink);
+        run::<K, u8, S>(level, &job, [bytes_of(forward), bytes_of(backward)], &mut room, sink);
     } else {
-        run::<K, u32, S>(level, &job, sheet, [forward, backward], stack, turned, sink);
+        run::<K, u32, S>(level, &job, [forward, backward], &mut room, sink);
     }
 }
 
@@ -96,6 +103,14 @@ struct Job<'a, K> {
     /// Frame axis along which the lines run.
     axis: usize,
     visit: Visit<'a>,
+}
+
+/// Parts of [`Buffers`] that the search needs.
+struct Room<'a, K> {
+    rows: &'a mut [K],
+    stack: &'a mut [u32],
+    starts: &'a mut [usize],
+    turned: &'a mut [u8],
 }
 
 /// Planes `i` (counted from the source's first) in `of` at which `lo <= start + shift[i] < hi`; `shift` is monotone.
@@ -116,15 +131,7 @@ fn span(shift: &[i32]) -> (i64, i64) {
     (a.min(b), a.max(b))
 }
 
-fn run<K: Key, H: Hit, S: Sink>(
-    level: Level,
-    job: &Job<K>,
-    sheet: &mut [K],
-    hits: [&mut [H]; 2],
-    stack: &mut [u32],
-    turned: &mut [u8],
-    sink: &mut S,
-) {
+fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2], room: &mut Room<K>, sink: &mut S) {
     let Job { volume, tile, axis, visit } = job;
     let (a, b) = (*axis, 1 - *axis);
     let origin = volume.region.lo[a];
@@ -146,8 +153,9 @@ fn run<K: Key, H: Hit, S: Sink>(
             }
             let first = queries.start.saturating_sub(visit.reach);
             let end = (queries.end + visit.reach).min(shift_b.len());
-            let sheet = &mut sheet[..(end - first) * LANES];
-            fill(volume, a, shift_b, shift_c, [s_b, s_c], first, sheet);
+            let starts = &mut room.starts[..end - first];
+            place(volume, a, shift_b, shift_c, [s_b, s_c], first, starts);
+            let sheet = Sheet { data: volume.data(), planes: starts };
             let count = queries.len() * LANES;
             let local = queries.start - first..queries.end - first;
             let mut answers: [&mut [H]; 2] = [&mut [], &mut []];
@@ -156,50 +164,49 @@ fn run<K: Key, H: Hit, S: Sink>(
                     answers[way] = &mut hits[..count];
                 }
             }
-            scan::both(level, sheet, local, visit.reach, answers.each_mut().map(|a| &mut **a), stack, turned);
-            for (row, plane) in queries.enumerate() {
+            let piece_of = |plane: usize| {
                 let start = s_c + shift_c[plane] as i64;
-                let (lo, hi) = (start.max(tile.lo[2]), (start + LANES as i64).min(tile.hi[2]));
+                let mut at = [0, 0, start.max(tile.lo[2])];
+                at[a] = origin + plane as i64;
+                at[b] = s_b + shift_b[plane] as i64;
+                (Piece { at, axis: a }, start)
+            };
+            queries.clone().for_each(|plane| sink.expect(visit, &piece_of(plane).0));
+            let asked = answers.each_mut().map(|a| &mut **a);
+            scan::both(level, sheet, local, visit.reach, asked, room.rows, room.stack, room.turned);
+            for (row, plane) in queries.enumerate() {
+                let (piece, start) = piece_of(plane);
+                let (lo, hi) = (piece.at[2], (start + LANES as i64).min(tile.hi[2]));
                 if lo >= hi {
                     continue;
                 }
-                let mut at = [0, 0, lo];
-                at[a] = origin + plane as i64;
-                at[b] = s_b + shift_b[plane] as i64;
                 let lanes = row * LANES + (lo - start) as usize..row * LANES + (hi - start) as usize;
-                let of = |answers: &'_ [H]| -> std::ops::Range<usize> {
-                    if answers.is_empty() { 0..0 } else { lanes.clone() }
-                };
+                let of = |answers: &'_ [H]| if answers.is_empty() { 0..0 } else { lanes.clone() };
                 let (f, b) = (&answers[0][of(answers[0])], &answers[1][of(answers[1])]);
-                sink.add(visit, &Piece { at, axis: a }, f, b);
+                sink.add(visit, &piece, f, b);
             }
         }
     }
 }
 
-/// Copies the planes of a sheet from plane `first` on; what lies outside of the source is zero.
-#[inline(always)]
-fn fill<K: Key>(
+/// Finds the planes of a sheet from plane `first` on; what lies outside of the source is at 0, where zeros stand.
+fn place<K: Key>(
     volume: &Volume<K>,
     a: usize,
     shift_b: &[i32],
     shift_c: &[i32],
     [s_b, s_c]: [i64; 2],
     first: usize,
-    sheet: &mut [K],
+    starts: &mut [usize],
 ) {
     let b = 1 - a;
     let n = volume.region.shape();
     let (lo_b, lo_c) = (volume.region.lo[b], volume.region.lo[2]);
-    for (i, row) in sheet.chunks_exact_mut(LANES).enumerate() {
-        let plane = first + i;
-        let j = s_b + shift_b[plane] as i64 - lo_b;
-        let k = s_c + shift_c[plane] as i64 - lo_c;
-        if j < 0 || j >= n[b] as i64 || k <= -(LANES as i64) || k >= n[2] as i64 {
-            row.fill(K::ZERO);
-            continue;
-        }
+    let shifts = shift_b[first..].iter().zip(&shift_c[first..]);
+    for ((plane, start), (&d_b, &d_c)) in (first..).zip(starts).zip(shifts) {
+        let (j, k) = (s_b + d_b as i64 - lo_b, s_c + d_c as i64 - lo_c);
+        let inside = (0..n[b] as i64).contains(&j) && (-(LANES as i64)..n[2] as i64).contains(&k);
         let (i0, i1) = if a == 0 { (plane, j as usize) } else { (j as usize, plane) };
-        row.copy_from_slice(volume.lanes(i0, i1, k));
+        *start = if inside { volume.start(i0, i1, k) } else { 0 };
     }
 }

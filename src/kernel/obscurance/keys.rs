@@ -47,6 +47,8 @@ pub(super) unsafe trait Plain: Copy {}
 unsafe impl Plain for i32 {}
 // SAFETY: as above.
 unsafe impl Plain for i64 {}
+// SAFETY: as above.
+unsafe impl Plain for usize {}
 
 /// Element types with an order-preserving map to a [`Key`].
 pub(super) trait Coded: Voxel {
@@ -125,11 +127,16 @@ impl<'a, K: Key> Volume<'a, K> {
         Volume { data, row, plane, region }
     }
 
-    /// [`LANES`] keys at `[i, j, k..]` counted from the corner of the box; `i` and `j` inside it, `-LANES <= k <= n`.
+    /// All keys; the first [`LANES`] are zeros, and so are those around every row.
+    pub fn data(&self) -> &'a [K] {
+        self.data
+    }
+
+    /// Place in [`Self::data`] of the [`LANES`] keys at `[i, j, k..]` counted from the corner of the box; `i` and `j`
+    /// inside it, `-LANES <= k <= n`.
     #[inline(always)]
-    pub fn lanes(&self, i: usize, j: usize, k: i64) -> &'a [K; LANES] {
-        let start = (i * self.plane + j * self.row + LANES) as i64 + k;
-        self.data[start as usize..][..LANES].first_chunk().unwrap()
+    pub fn start(&self, i: usize, j: usize, k: i64) -> usize {
+        ((i * self.plane + j * self.row + LANES) as i64 + k) as usize
     }
 }
 

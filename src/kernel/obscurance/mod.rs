@@ -5,14 +5,16 @@
 //! | `lines` | directions to families of lines, distances, fixed-point contributions |
 //! | `keys` | voxels to padded, order-preserving unsigned keys |
 //! | `driver` | tiles, sheets, senses |
-//! | `scan` | next greater key on 64 lines |
-//! | `wide` | the same by AVX-512 |
-//! | `sinks` | what is summed |
+//! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide`: by AVX-512 |
+//! | `sinks`, `contribute` | what is summed |
 //! | `reference` | all of it by the definition |
 
+mod contribute;
 mod driver;
 mod keys;
 mod lines;
+#[cfg(target_arch = "x86_64")]
+mod narrow;
 #[cfg(test)]
 mod reference;
 mod scan;
@@ -141,6 +143,7 @@ impl Prepared {
         let (sheet, bytes) = carve::<T::Key>(bytes, sizes.sheet * LANES);
         let (hits, bytes) = carve_all::<u32, 2>(bytes, sizes.queries * LANES);
         let (stack, bytes) = carve::<u32>(bytes, sizes.sheet);
+        let (starts, bytes) = carve::<usize>(bytes, sizes.sheet);
         let (turned, bytes) = carve::<u8>(bytes, sizes.turned(size_of::<T>()));
         let (shifts, bytes) = carve_all::<i32, 2>(bytes, sizes.extent);
         let (tables, bytes) = carve_all::<u32, 2>(bytes, sizes.extent + 1);
@@ -157,11 +160,16 @@ impl Prepared {
             volumes: [natural, swapped],
             src_box,
             dst_box,
-            buffers: Buffers { sheet, hits, stack, turned, shifts, tables },
+            buffers: Buffers { sheet, hits, stack, starts, turned, shifts, tables },
         };
         let missing = keys::missing_of::<T>(self.params.missing);
-        let gone =
-            |p: [i64; 3]| keys::is_missing(src.at(std::array::from_fn(|a| (p[a] - src_box.lo[a]) as usize)), missing);
+        // NaN where a voxel of the row that starts at `p` is missing.
+        let gone = |p: [i64; 3], row: &mut [f32]| {
+            let [z, y, x] = [0, 1, 2].map(|a| (p[a] - src_box.lo[a]) as usize);
+            for (out, &v) in row.iter_mut().zip(&src.row_at(z, y)[x..]) {
+                *out = if keys::is_missing(v, missing) { f32::NAN } else { *out };
+            }
+        };
         pass.tiles(io, bytes, &gone);
     }
 }
@@ -179,7 +187,7 @@ struct Pass<'a, K> {
 }
 
 impl<K: Key> Pass<'_, K> {
-    fn tiles(&mut self, io: ObscuranceIo, bytes: &mut [u8], gone: &dyn Fn([i64; 3]) -> bool) {
+    fn tiles(&mut self, io: ObscuranceIo, bytes: &mut [u8], gone: &dyn Fn([i64; 3], &mut [f32])) {
         let ObscuranceIo { colour, normal, openness, rgb } = io;
         let mut openness = openness.map(f32_view);
         let mut rgb = rgb.map(|views| views.map(f32_view));
@@ -224,21 +232,28 @@ impl<K: Key> Pass<'_, K> {
                 fast_sum.merge();
             }
             let total = self.prepared.total;
-            for (i, p) in tile.iter().enumerate() {
-                let at: [usize; 3] = std::array::from_fn(|a| (p[a] - dst_box.lo[a]) as usize);
-                let gone = gone(p);
+            let [nz, ny, nx] = tile.shape();
+            let at = dst_box.offset_of(&tile);
+            for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
+                let first = (z * ny + y) * nx;
+                let gone = |row: &mut [f32]| gone([tile.lo[0] + z as i64, tile.lo[1] + y as i64, tile.lo[2]], row);
                 if let Some(out) = &mut openness {
-                    let value = match fast {
-                        true if self.flat => 1.0,
-                        true => fast_sum.openness(i, total),
-                        false => wide_sum.openness(i),
-                    };
-                    out.set(at, if gone { f32::NAN } else { value });
-                }
-                if let Some(out) = &mut rgb {
-                    for (out, value) in out.iter_mut().zip(wide_sum.colour_of(i)) {
-                        out.set(at, if gone { f32::NAN } else { value });
+                    let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
+                    for (x, out) in row.iter_mut().enumerate() {
+                        *out = match fast {
+                            true if self.flat => 1.0,
+                            true => fast_sum.openness(first + x, total),
+                            false => wide_sum.openness(first + x),
+                        };
                     }
+                    gone(row);
+                }
+                for (c, out) in rgb.iter_mut().flatten().enumerate() {
+                    let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
+                    for (x, out) in row.iter_mut().enumerate() {
+                        *out = wide_sum.colour_of(first + x, c);
+                    }
+                    gone(row);
                 }
             }
         }
@@ -292,6 +307,7 @@ impl Sizes {
             + line(self.sheet * LANES * key)
             + 2 * line(self.queries * LANES * 4)
             + line(self.sheet * 4)
+            + line(self.sheet * size_of::<usize>())
             + line(self.turned(key))
             + 2 * line(self.extent * 4)
             + 2 * line((self.extent + 1) * 4)

@@ -11,6 +11,8 @@ pub(super) trait Hit: Copy + Default + Send + Sync + 'static {
     fn steps(self) -> usize;
     /// The same slice if answers are bytes, else an empty one.
     fn bytes(answers: &mut [Self]) -> &mut [u8];
+    /// The same slice if answers are bytes.
+    fn as_bytes(answers: &[Self]) -> Option<&[u8]>;
 }
 
 impl Hit for u8 {
@@ -24,6 +26,10 @@ impl Hit for u8 {
     }
     fn bytes(answers: &mut [u8]) -> &mut [u8] {
         answers
+    }
+    #[inline(always)]
+    fn as_bytes(answers: &[u8]) -> Option<&[u8]> {
+        Some(answers)
     }
 }
 
@@ -39,106 +45,18 @@ impl Hit for u32 {
     fn bytes(_: &mut [u32]) -> &mut [u8] {
         &mut []
     }
+    fn as_bytes(_: &[u32]) -> Option<&[u8]> {
+        None
+    }
 }
-
-/// Queries that share one pass over the planes ahead.
-const QUERIES: usize = 4;
-/// Steps between two looks at whether all queries are answered, and at most what a `u8` key can count.
-const BURST: usize = 16;
 
 /// For each query plane in `queries` and each lane: `hits` gets the number of planes before the first one ahead with a
-/// greater key, or `reach` where there is none within `reach` planes or inside the sheet.
+/// greater key, or `reach` where there is none within `reach` planes or inside the sheet. `ahead` says whether lines go
+/// to growing plane numbers.
 ///
-/// `sheet` holds planes of [`LANES`] keys; `ahead` says whether lines go to growing plane numbers. `L` divides [`LANES`].
-#[inline(always)]
-pub(super) fn brute<K: Key, H: Hit, const L: usize>(
-    sheet: &[K],
-    queries: Range<usize>,
-    reach: usize,
-    ahead: bool,
-    hits: &mut [H],
-) {
-    let planes = sheet.len() / LANES;
-    for (group, out) in hits.chunks_mut(QUERIES * LANES).enumerate() {
-        let first = queries.start + group * QUERIES;
-        if first >= queries.end {
-            break;
-        }
-        let count = QUERIES.min(queries.end - first);
-        for lane in (0..LANES).step_by(L) {
-            if count == QUERIES {
-                burst::<K, H, L, QUERIES>(sheet, planes, first, lane, reach, ahead, out);
-            } else {
-                for q in 0..count {
-                    burst::<K, H, L, 1>(sheet, planes, first + q, lane, reach, ahead, &mut out[q * LANES..]);
-                }
-            }
-        }
-    }
-}
-
-/// `Q` query planes from `first` on, lanes `lane..lane + L`.
-#[inline(always)]
-fn burst<K: Key, H: Hit, const L: usize, const Q: usize>(
-    sheet: &[K],
-    planes: usize,
-    first: usize,
-    lane: usize,
-    reach: usize,
-    ahead: bool,
-    out: &mut [H],
-) {
-    let row = |plane: usize| -> &[K; L] { sheet[plane * LANES + lane..][..L].first_chunk().unwrap() };
-    let query: [[K; L]; Q] = std::array::from_fn(|q| *row(first + q));
-    let mut alive = [[K::MAX; L]; Q];
-    let mut total = [[H::default(); L]; Q];
-    // Planes that every query of the group can look at, then those left to single ones.
-    let room = |q: usize| if ahead { planes - 1 - (first + q) } else { first + q };
-    let common = if ahead { room(Q - 1) } else { room(0) }.min(reach);
-    let mut done = 0;
-    while done < common {
-        let steps = BURST.min(common - done);
-        let mut count = [[K::ZERO; L]; Q];
-        for j in done + 1..=done + steps {
-            for q in 0..Q {
-                let r = row(if ahead { first + q + j } else { first + q - j });
-                for l in 0..L {
-                    alive[q][l] = if r[l] > query[q][l] { K::ZERO } else { alive[q][l] };
-                    count[q][l] = count[q][l].wrapping_add(alive[q][l].and(K::ONE));
-                }
-            }
-        }
-        done += steps;
-        let mut any = K::ZERO;
-        for q in 0..Q {
-            for l in 0..L {
-                total[q][l] = H::of(total[q][l].steps() + count[q][l].to_usize());
-                any = any.max(alive[q][l]);
-            }
-        }
-        if any == K::ZERO {
-            break;
-        }
-    }
-    for q in 0..Q {
-        for l in 0..L {
-            let mut steps = total[q][l].steps();
-            if alive[q][l] != K::ZERO {
-                let more = |j: &usize| {
-                    let plane = if ahead { first + q + j } else { first + q - j };
-                    sheet[plane * LANES + lane + l] > query[q][l]
-                };
-                steps = (common + 1..=room(q).min(reach)).find(more).map_or(reach, |j| j - 1);
-            }
-            out[q * LANES + lane + l] = H::of(steps);
-        }
-    }
-}
-
-/// The same by a stack of candidates per line: time per voxel is bounded for any reach and any data.
-/// `stack` holds at least one entry per plane.
-#[inline(always)]
-pub(super) fn stacked<K: Key, H: Hit>(
+/// By a stack of candidates per line: time per voxel is bounded for any reach and any data. `stack` holds at least one
+/// entry per plane.
+fn stacked<K: Key, H: Hit>(
     sheet: &[K],
     queries: Range<usize>,
     reach: usize,
@@ -167,13 +85,39 @@ pub(super) fn stacked<K: Key, H: Hit>(
     }
 }
 
+/// Planes of 64 keys, where they stand in a padded volume.
+#[derive(Clone, Copy)]
+pub(super) struct Sheet<'a, K> {
+    pub data: &'a [K],
+    /// Start of each plane in `data`; 0 is a place of zeros.
+    pub planes: &'a [usize],
+}
+
+impl<K: Key> Sheet<'_, K> {
+    /// Copies the planes into consecutive rows.
+    pub fn copy_to(&self, rows: &mut [K]) {
+        let (rows, _) = rows.as_chunks_mut::<LANES>();
+        for (row, &start) in rows.iter_mut().zip(self.planes) {
+            *row = *self.data[start..].first_chunk().expect("a plane has 64 keys");
+        }
+    }
+}
+
+/// Reach times bytes of a key up to which brute force beats the stack: it costs about 1/100 ns per step and byte, the
+/// stack 5 to 10 ns.
+#[cfg(target_arch = "x86_64")]
+const BRUTE: usize = 768;
+
 /// Answers of both senses (growing plane numbers first); an empty slice of hits is a sense that is not asked for.
+/// `rows` and `stack` have room for the planes, `turned` for what the AVX-512 search asks.
+#[allow(clippy::too_many_arguments)]
 pub(super) fn both<K: Key, H: Hit>(
     level: Level,
-    sheet: &[K],
+    sheet: Sheet<K>,
     queries: Range<usize>,
     reach: usize,
     hits: [&mut [H]; 2],
+    rows: &mut [K],
     stack: &mut [u32],
     turned: &mut [u8],
 ) {
@@ -184,38 +128,19 @@ pub(super) fn both<K: Key, H: Hit>(
         return unsafe { super::wide::next_greater(sheet, queries, reach, hits, turned) };
     }
     let _ = turned;
+    let rows = &mut rows[..sheet.planes.len() * LANES];
+    sheet.copy_to(rows);
     for (way, hits) in hits.into_iter().enumerate() {
-        if !hits.is_empty() {
-            next_greater(level, sheet, queries.clone(), reach, way == 0, hits, stack);
+        if hits.is_empty() {
+            continue;
         }
-    }
-}
-
-crate::multiversion! {
-    /// Chooses between the two; see [`brute`] for the arguments.
-    pub(super) fn next_greater[K: Key, H: Hit](
-        sheet: &[K], queries: Range<usize>, reach: usize, ahead: bool, hits: &mut [H], stack: &mut [u32]
-    ) -> () = next_greater_inner;
-}
-
-/// Chooses between the two: brute force costs about 1/100 ns per step and byte of a key, the stack about 10 ns.
-#[inline(always)]
-fn next_greater_inner<K: Key, H: Hit>(
-    sheet: &[K],
-    queries: Range<usize>,
-    reach: usize,
-    ahead: bool,
-    hits: &mut [H],
-    stack: &mut [u32],
-) {
-    let planes = sheet.len() / LANES;
-    if reach.min(planes) * size_of::<K>() > 1024 {
-        return stacked(sheet, queries, reach, ahead, hits, stack);
-    }
-    match size_of::<K>() {
-        1 => brute::<K, H, 64>(sheet, queries, reach, ahead, hits),
-        2 => brute::<K, H, 32>(sheet, queries, reach, ahead, hits),
-        4 => brute::<K, H, 16>(sheet, queries, reach, ahead, hits),
-        _ => brute::<K, H, 8>(sheet, queries, reach, ahead, hits),
+        #[cfg(target_arch = "x86_64")]
+        if size_of::<H>() == 1 && reach * size_of::<K>() <= BRUTE {
+            let bytes = H::bytes(&mut *hits);
+            if super::narrow::brute(level, rows, queries.clone(), reach, way == 0, bytes) {
+                continue;
+            }
+        }
+        stacked(rows, queries.clone(), reach, way == 0, hits, stack);
     }
 }

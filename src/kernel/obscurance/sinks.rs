@@ -1,6 +1,7 @@
 //! What a sweep accumulates. The driver hands every sink the answers of both senses for a piece of a row; sums are
 //! integers, so that order never matters.
 
+use super::contribute::{self, ByteTables};
 use super::lines::Family;
 use super::scan::Hit;
 use crate::grid::{Region, View};
@@ -15,6 +16,8 @@ pub(super) struct Visit<'a> {
     pub reach: usize,
     /// Contributions by answer, `reach + 1` per sense.
     pub tables: [&'a [u32]; 2],
+    /// The three bytes of each contribution, by sense, byte and answer; for answers below 256.
+    pub bytes: &'a ByteTables,
     /// Displacement along the two other frame axes at each plane of the source, counted from `origin`.
     pub shifts: [&'a [i32]; 2],
     /// First global plane of the source.
@@ -33,6 +36,8 @@ pub(super) struct Piece {
 /// is not swept.
 pub(super) trait Sink {
     fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]);
+    /// Told of each piece some time before it comes, so that its sums can be fetched.
+    fn expect(&self, _visit: &Visit, _piece: &Piece) {}
 }
 
 impl<A: Sink, B: Sink> Sink for (A, B) {
@@ -40,6 +45,9 @@ impl<A: Sink, B: Sink> Sink for (A, B) {
     fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
         self.0.add(visit, piece, forward, backward);
         self.1.add(visit, piece, forward, backward);
+    }
+    fn expect(&self, visit: &Visit, piece: &Piece) {
+        self.0.expect(visit, piece);
     }
 }
 
@@ -75,6 +83,15 @@ impl OpenSum<'_> {
         }
     }
 
+    /// Where the sums of a piece start in the buffer of its frame.
+    #[inline(always)]
+    fn start(&self, visit: &Visit, piece: &Piece) -> usize {
+        let [_, b, c] = visit.perm;
+        let n = self.tile.shape();
+        let at = |k: usize| (piece.at[k] - self.tile.lo[visit.perm[k]]) as usize;
+        (at(0) * n[b] + at(1)) * n[c] + at(2)
+    }
+
     /// Openness of voxel `i` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes.
     pub fn openness(&self, i: usize, total: u64) -> f32 {
         (self.sums[0][i] as f64 / total as f64) as f32
@@ -83,28 +100,22 @@ impl OpenSum<'_> {
 
 impl Sink for OpenSum<'_> {
     fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
-        let [_, b, c] = visit.perm;
-        let n = self.tile.shape();
-        let at = |k: usize| (piece.at[k] - self.tile.lo[visit.perm[k]]) as usize;
-        let start = (at(0) * n[b] + at(1)) * n[c] + at(2);
+        let start = self.start(visit, piece);
         let len = forward.len().max(backward.len());
-        let sums = &mut self.sums[usize::from(c == 0)][start..start + len];
-        add_contributions(self.level, sums, forward, backward, visit.tables);
+        let sums = &mut self.sums[usize::from(visit.perm[2] == 0)][start..start + len];
+        contribute::add(self.level, sums, forward, backward, visit);
     }
-}
 
-crate::multiversion! {
-    fn add_contributions['a, H: Hit](
-        sums: &mut [u32], forward: &[H], backward: &[H], tables: [&'a [u32]; 2]
-    ) -> () = add_contributions_inner;
-}
-
-#[inline(always)]
-fn add_contributions_inner<H: Hit>(sums: &mut [u32], forward: &[H], backward: &[H], tables: [&[u32]; 2]) {
-    for (answers, table) in [(forward, tables[0]), (backward, tables[1])] {
-        for (sum, answer) in sums.iter_mut().zip(answers) {
-            *sum += table[answer.steps()];
+    #[inline(always)]
+    fn expect(&self, visit: &Visit, piece: &Piece) {
+        #[cfg(target_arch = "x86_64")]
+        for line in 0..5 {
+            use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+            let sums = self.sums[usize::from(visit.perm[2] == 0)].as_ptr();
+            // SAFETY: prefetching touches nothing, wherever the address points; every x86-64 has SSE.
+            unsafe { _mm_prefetch::<_MM_HINT_T1>(sums.wrapping_add(self.start(visit, piece) + 16 * line).cast()) };
         }
+        let _ = (visit, piece);
     }
 }
 
@@ -157,13 +168,12 @@ impl WeightedSum<'_> {
         if self.weights[i] == 0 { 1.0 } else { (self.open[i] as f64 / self.weights[i] as f64) as f32 }
     }
 
-    /// Colour of voxel `i` of the tile.
-    pub fn colour_of(&self, i: usize) -> [f32; 3] {
-        let weight = self.weights[i] as f64;
-        std::array::from_fn(|c| match weight {
-            0.0 => self.ambient[c] as f32,
-            w => (self.rgb[c][i] as f64 / w) as f32,
-        })
+    /// Component `c` of the colour of voxel `i` of the tile.
+    pub fn colour_of(&self, i: usize, c: usize) -> f32 {
+        match self.weights[i] {
+            0 => self.ambient[c] as f32,
+            weight => (self.rgb[c][i] as f64 / weight as f64) as f32,
+        }
     }
 
     /// One answer of one voxel: `p` is its global index in natural order.

@@ -133,7 +133,10 @@ fn every_search_finds_the_next_greater_key() {
                 let steps = free.by_ref().count();
                 if steps < reach && at(steps + 1) < planes { steps } else { reach }
             };
+            let starts: Vec<usize> = (0..planes).map(|i| i * LANES).collect();
+            let place = super::scan::Sheet { data: &sheet, planes: &starts };
             let mut stack = vec![0; planes];
+            let mut rows = sheet.clone();
             #[cfg(target_arch = "x86_64")]
             let mut scratch = vec![0u64; super::wide::scratch_bytes(planes, to - from, size_of::<K>()) / 8 + 8];
             for level in Level::available() {
@@ -146,13 +149,22 @@ fn every_search_finds_the_next_greater_key() {
                     // SAFETY: as above.
                     let (_, turned, _) = unsafe { turned.align_to_mut::<u8>() };
                     let start = turned.as_ptr().align_offset(64);
-                    super::scan::both(level, &sheet, from..to, reach, [f, b], &mut stack, &mut turned[start..]);
+                    super::scan::both(
+                        level,
+                        place,
+                        from..to,
+                        reach,
+                        [f, b],
+                        &mut rows,
+                        &mut stack,
+                        &mut turned[start..],
+                    );
                     for (h, b) in hits.iter_mut().zip(&bytes) {
                         h.iter_mut().zip(b).for_each(|(h, b)| *h = *b as u32);
                     }
                 } else {
                     let [f, b] = hits.each_mut();
-                    super::scan::both(level, &sheet, from..to, reach, [f, b], &mut stack, &mut []);
+                    super::scan::both(level, place, from..to, reach, [f, b], &mut rows, &mut stack, &mut []);
                 }
                 for (ahead, hits) in [true, false].into_iter().zip(&hits) {
                     for (i, &got) in hits.iter().enumerate() {

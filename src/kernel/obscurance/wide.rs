@@ -10,6 +10,7 @@ use std::arch::x86_64::*;
 use std::ops::Range;
 
 use super::keys::{Key, LANES};
+use super::scan::Sheet;
 
 /// Longest reach whose answers fit into the bytes that are turned back.
 pub(super) const MAX_REACH: usize = u8::MAX as usize;
@@ -31,25 +32,26 @@ pub(super) fn scratch_bytes(planes: usize, queries: usize, size: usize) -> usize
 /// The CPU must have [`crate::kernel::simd::Level::Avx512`].
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,avx2,bmi1,bmi2,lzcnt,popcnt")]
 pub(super) unsafe fn next_greater<K: Key>(
-    sheet: &[K],
+    sheet: Sheet<K>,
     queries: Range<usize>,
     reach: usize,
     hits: [&mut [u8]; 2],
     scratch: &mut [u8],
 ) {
-    let planes = sheet.len() / LANES;
+    let planes = sheet.planes.len();
     assert!(reach <= MAX_REACH && queries.end <= planes);
     assert!(scratch.len() >= scratch_bytes(planes, queries.len(), size_of::<K>()));
     assert_eq!(scratch.as_ptr() as usize % 64, 0);
     assert!(hits.iter().all(|h| h.is_empty() || h.len() >= queries.len() * LANES));
-    let sheet = sheet.as_ptr();
+    assert!(sheet.planes.iter().all(|start| start + LANES <= sheet.data.len()));
+    let (data, starts) = (sheet.data.as_ptr(), sheet.planes);
     // SAFETY: `Key` is implemented for these four types only, told apart by their size; extents were checked above.
     unsafe {
         match size_of::<K>() {
-            1 => keys_u8(sheet.cast(), planes, queries, reach, hits, scratch),
-            2 => keys_u16(sheet.cast(), planes, queries, reach, hits, scratch),
-            4 => keys_u32(sheet.cast(), planes, queries, reach, hits, scratch),
-            _ => keys_u64(sheet.cast(), planes, queries, reach, hits, scratch),
+            1 => keys_u8(data.cast(), starts, queries, reach, hits, scratch),
+            2 => keys_u16(data.cast(), starts, queries, reach, hits, scratch),
+            4 => keys_u32(data.cast(), starts, queries, reach, hits, scratch),
+            _ => keys_u64(data.cast(), starts, queries, reach, hits, scratch),
         }
     }
 }
@@ -107,11 +109,11 @@ macro_rules! search {
         $le:ident, $mask_gt:ident, $mask_add:ident, $blend:ident, $mask:ty, $lane_type:ty, $store:expr
     ) => {
         /// # Safety
-        /// As [`next_greater`], with `sheet` of `planes` rows of 64 keys.
+        /// As [`next_greater`], with 64 keys at each of `starts` in `data`.
         #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,avx2,bmi1,bmi2,lzcnt,popcnt")]
         unsafe fn $name(
-            sheet: *const $t,
-            planes: usize,
+            data: *const $t,
+            starts: &[usize],
             queries: Range<usize>,
             reach: usize,
             hits: [&mut [u8]; 2],
@@ -122,6 +124,7 @@ macro_rules! search {
             const LEVELS: usize = $levels;
             /// Rows that are turned at once: 16 bytes of a line.
             const GROUP: usize = $group;
+            let planes = starts.len();
             // Blocks are counted so that the first query starts one.
             let front = queries.start.div_ceil(R);
             let blocks = front + (planes - queries.start).div_ceil(R);
@@ -144,9 +147,11 @@ macro_rules! search {
                     let mut t = [zero; GROUP];
                     for (i, t) in t.iter_mut().enumerate() {
                         let plane = (p + i) as isize + offset;
-                        if (0..planes as isize).contains(&plane) {
-                            // SAFETY: `plane` is a row of the sheet.
-                            *t = unsafe { _mm512_loadu_si512(sheet.add(plane as usize * LANES + column * R).cast()) };
+                        if let Some(&start) = starts.get(plane as usize) {
+                            // SAFETY: 64 keys start there. (A plane before the first is a huge number.)
+                            *t = unsafe { _mm512_loadu_si512(data.add(start + column * R).cast()) };
+                            // The sheet that comes next stands 64 keys further on. Prefetching touches nothing.
+                            _mm_prefetch::<_MM_HINT_T0>(data.wrapping_add(start + 2 * LANES + column * R).cast());
                         }
                     }
                     for _ in 0..$rounds {
