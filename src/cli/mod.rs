@@ -15,7 +15,6 @@ pub mod moments;
 pub mod plot;
 pub mod progress;
 pub mod reader;
-pub mod similarity;
 
 use std::process::ExitCode;
 

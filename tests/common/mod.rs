@@ -24,8 +24,10 @@ pub fn bytes<T: Voxel>(voxels: &[T]) -> Vec<u8> {
 
 /// Writes an array as .npy.
 pub fn write_npy(path: &Path, descr: &str, shape: [usize; 3], data: &[u8]) {
-    let mut header =
-        format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({}, {}, {}), }}", shape[0], shape[1], shape[2]);
+    let mut header = format!(
+        "{{'descr': '{descr}', 'fortran_order': False, 'shape': ({}, {}, {}), }}",
+        shape[0], shape[1], shape[2]
+    );
     while (10 + header.len() + 1) % 64 != 0 {
         header.push(' ');
     }
@@ -91,7 +93,10 @@ pub type Decoded = BTreeMap<String, (Vec<usize>, Vec<u64>)>;
 pub fn decode(path: &Path) -> Decoded {
     let mut all = Decoded::new();
     for level in 0.. {
-        let text = format!("[input.a]\npath = '{}'\nlevel = {level}\nchannel = 'all'\n[output.b]\npath = 'b.npy'\nfrom = 'a'\n", path.display());
+        let text = format!(
+            "[input.a]\npath = '{}'\nlevel = {level}\nchannel = 'all'\n[output.b]\npath = 'b.npy'\nfrom = 'a'\n",
+            path.display()
+        );
         let Ok(config) = config::parse(&text, Path::new("/nowhere/config.toml"), &[]) else { break };
         let Ok(mut source) = occlude::store::Source::open(&config.inputs[0]) else { break };
         source.prepare(Path::new("/nowhere"), &|_| true).unwrap();
