@@ -63,7 +63,7 @@ fn wrong_usage_is_2_and_leaves_stdout_empty() {
         (vec!["plan", "gone.toml"], 1, "gone.nrrd"),
         (vec!["info", "gone.nrrd"], 1, "gone.nrrd"),
         (vec!["compare", "a.npy", "b.npy"], 1, "a.npy"),
-        (vec!["compare", "a.npy", "b.npy", "--max-rmse=-1"], 2, "at least 0"),
+        (vec!["compare", "a.npy", "b.npy", "--max-rmse", "-1"], 2, "at least 0"),
         (vec!["preview", "a.npy", "o.png", "--slice", "w=3"], 2, "z=40"),
         (vec!["preview", "a.npy", "o.png", "--range", "3,1"], 2, "LO below HI"),
         (vec!["pareto", "gone.toml"], 2, "pareto: missing"),
@@ -78,6 +78,9 @@ fn wrong_usage_is_2_and_leaves_stdout_empty() {
         let (code, out, err) = call(f, &args);
         assert!(code == 0 && !out.is_empty() && err.is_empty(), "{args:?}");
     }
+    // An input that nothing reads is not looked for.
+    let reference = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/reference.toml");
+    assert_eq!(call(f, &["plan", reference]).0, 0);
     assert!(json(f, &["schema"])["properties"]["run"].is_object());
     assert!(call(f, &["completions", "bash"]).1.contains("occlude"));
 }
