@@ -165,7 +165,7 @@ pub struct CompareArgs {
     #[arg(long)]
     pub json: bool,
     /// Exit with 1 where the root mean square error is above this
-    #[arg(long, value_name = "X", value_parser = bound)]
+    #[arg(long, value_name = "X", value_parser = bound, allow_hyphen_values = true)]
     pub max_rmse: Option<f64>,
     #[command(flatten)]
     pub raw: RawArgs,

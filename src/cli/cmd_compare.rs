@@ -7,9 +7,9 @@ use serde_json::json;
 use super::args::CompareArgs;
 use super::moments::{Magnitudes, Moments};
 use super::reader::Volume;
-use super::similarity::Similarity;
 use super::{human, messages, usage};
 use crate::Result;
+use crate::kernel::ssim::Ssim;
 use crate::run::Cancel;
 
 /// How two volumes differ, over the voxels that both have.
@@ -77,7 +77,7 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
     let mut plane = [0, 1].map(|_| vec![0.0; ia.shape[1] * ia.shape[2]]);
     for component in 0..components {
         let (mut pa, mut pb) = (a.planes(component)?, b.planes(component)?);
-        let mut similarity = Similarity::new([ia.shape[1], ia.shape[2]], range);
+        let mut similarity = Ssim::new([ia.shape[1], ia.shape[2]], range);
         loop {
             cancel.check()?;
             let [va, vb] = &mut plane;
@@ -85,14 +85,14 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
                 break;
             }
             sums.add(va, vb);
-            similarity.push(va, vb);
+            similarity.push_plane(va, vb);
         }
         sums.similar(similarity.finish());
     }
     Ok(sums.finish())
 }
 
-/// Largest minus least value of all components.
+/// Largest minus least finite value of all components; 1 of a constant, so that equal constants are alike.
 fn value_range(volume: &Volume, components: usize, cancel: &Cancel) -> Result<f64> {
     let mut all = Moments::default();
     for component in 0..components {
@@ -103,7 +103,8 @@ fn value_range(volume: &Volume, components: usize, cancel: &Cancel) -> Result<f6
             all = all.merge(Moments::of(&plane));
         }
     }
-    Ok(if all.max > all.min { all.max - all.min } else { 0.0 })
+    let range = all.max - all.min;
+    Ok(if range > 0.0 && range.is_finite() { range } else { 1.0 })
 }
 
 /// Running sums over pairs.

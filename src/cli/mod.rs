@@ -15,7 +15,6 @@ pub mod moments;
 pub mod plot;
 pub mod progress;
 pub mod reader;
-pub mod similarity;
 
 use std::process::ExitCode;
 
@@ -72,6 +71,7 @@ fn command(cli: &Cli) -> Result<ExitCode> {
 fn load(args: &ConfigArgs, more: &[String]) -> Result<Config> {
     let sets: Vec<String> = args.sets.iter().chain(more).cloned().collect();
     let mut config = config::load(&args.config, &sets)?;
+    drop_unused_inputs(&mut config);
     if let Some(device) = args.device {
         config.run.device = match device {
             DeviceArg::Auto => Device::Auto,
@@ -87,6 +87,12 @@ fn load(args: &ConfigArgs, more: &[String]) -> Result<Config> {
         config.run.memory = memory;
     }
     Ok(config)
+}
+
+/// Inputs that nothing reads have been checked as text; they are not opened, so they need not exist.
+fn drop_unused_inputs(config: &mut Config) {
+    let used: Vec<String> = config.needed_names().into_iter().map(String::from).collect();
+    config.inputs.retain(|i| used.contains(&i.name));
 }
 
 /// Wrong usage of a flag (exit code 2).

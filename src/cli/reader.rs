@@ -336,7 +336,7 @@ mod tests {
     #[test]
     fn recorded_ranges_are_for_codes_only() {
         let attributes =
-            Attributes { occlude: Some(serde_json::json!({"value_range": [-1.0, 1.0]})), datasets: Vec::new() };
+            Attributes { occlude: Some(serde_json::json!({"value_range": [-1.0, 1.0]})), ..Attributes::default() };
         assert_eq!(recorded(DType::U8, &attributes).unwrap().apply(255.0), 1.0);
         assert_eq!(recorded(DType::U16, &attributes).unwrap().apply(0.0), -1.0);
         assert_eq!(recorded(DType::F32, &attributes), None);

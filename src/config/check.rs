@@ -44,6 +44,13 @@ impl Config {
         reference.channel.as_deref().or_else(|| op_channels(stage.op.word()).first().copied())
     }
 
+    /// Names that outputs and the stages they need read; inputs among them are the ones that must exist.
+    pub fn needed_names(&self) -> Vec<&str> {
+        let stages = self.needed_stages();
+        let read = stages.iter().flat_map(|s| s.reads()).map(|(_, r)| r.name.as_str());
+        read.chain(self.outputs.iter().flat_map(|o| &o.from).map(|r| r.name.as_str())).collect()
+    }
+
     /// Stages that outputs need, directly or not, in the order of the file.
     pub fn needed_stages(&self) -> Vec<&StageNode> {
         let mut needed = vec![false; self.stages.len()];

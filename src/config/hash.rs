@@ -12,8 +12,7 @@ use super::{Config, InputKind};
 pub fn config_hash(config: &Config) -> String {
     let mut parts: Vec<String> = Vec::new();
     let stages = config.needed_stages();
-    let mut used: Vec<&str> = stages.iter().flat_map(|s| s.reads()).map(|(_, r)| r.name.as_str()).collect();
-    used.extend(config.outputs.iter().flat_map(|o| &o.from).map(|r| r.name.as_str()));
+    let used = config.needed_names();
     for i in config.inputs.iter().filter(|i| used.contains(&i.name.as_str())) {
         let kind = match &i.kind {
             InputKind::Path { raw, .. } => format!("{raw:?}"),
