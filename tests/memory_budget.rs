@@ -1,0 +1,110 @@
+//! Memory is bounded (SPEC 5.3): private resident memory stays under the budget plus 128 MiB, whatever the volume's size;
+//! a budget that is too small is refused with the least that would do.
+
+mod common;
+
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use common::*;
+
+const MIB: u64 = 1 << 20;
+
+/// Most private resident bytes of a child, sampled from outside until it ends.
+fn peak_of(mut child: std::process::Child) -> (u64, std::process::ExitStatus) {
+    let path = format!("/proc/{}/status", child.id());
+    let mut peak = 0;
+    loop {
+        let status = std::fs::read_to_string(&path).unwrap_or_default();
+        let line = status.lines().find(|l| l.starts_with("RssAnon:"));
+        let kib = line.and_then(|l| l.split_whitespace().nth(1)).and_then(|n| n.parse::<u64>().ok());
+        peak = peak.max(kib.unwrap_or(0) * 1024);
+        if let Some(status) = child.try_wait().unwrap() {
+            return (peak, status);
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+#[test]
+fn a_gibibyte_under_a_quarter_of_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("config.toml");
+    let text = r#"
+[run]
+memory = "256MiB"
+threads = 2
+[input.big]
+synthetic = "gyroid"
+shape = [1024, 1024, 1024]
+dtype = "u8"
+[stage.ao]
+op = "ambient_occlusion"
+input = "big"
+method = "cdf_power"
+radius = 10
+[output.ao]
+path = "ao.zarr"
+from = "ao"
+"#;
+    std::fs::write(&path, text).unwrap();
+    let child =
+        Command::new(program()).arg("run").arg(&path).arg("-q").stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
+    let (peak, status) = peak_of(child);
+    assert!(status.success());
+    println!("peak {} MiB under a budget of 256 MiB", peak / MIB);
+    assert!(peak <= (256 + 128) * MIB, "peak {} MiB", peak / MIB);
+    // The same through a chunked source, whose decoded chunks count as well.
+    let second = r#"
+[run]
+memory = "256MiB"
+threads = 2
+[input.big]
+path = "ao.zarr"
+[stage.stats]
+op = "box"
+input = "big"
+radius = 5
+[output.mean]
+path = "mean.zarr"
+from = ["stats.mean", "stats.variance"]
+"#;
+    let path = dir.path().join("second.toml");
+    std::fs::write(&path, second).unwrap();
+    let child =
+        Command::new(program()).arg("run").arg(&path).arg("-q").stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
+    let (peak, status) = peak_of(child);
+    assert!(status.success());
+    println!("peak {} MiB from Zarr under a budget of 256 MiB", peak / MIB);
+    assert!(peak <= (256 + 128) * MIB, "peak {} MiB", peak / MIB);
+}
+
+#[test]
+fn a_budget_too_small_for_one_brick_is_refused_with_the_least_that_does() {
+    let dir = tempfile::tempdir().unwrap();
+    let text = r#"
+[run]
+memory = "30MiB"
+threads = 1
+[input.a]
+synthetic = "noise"
+shape = [300, 300, 300]
+dtype = "f32"
+[stage.s]
+op = "obscurance"
+input = "a"
+max_distance = 100
+[output.o]
+path = "o.zarr"
+from = "s"
+"#;
+    let config = parse(dir.path(), text, &[]);
+    let error = occlude::run::run(&config, &Default::default(), &occlude::run::Silent).unwrap_err();
+    assert_eq!(error.exit_code(), 2);
+    let message = error.to_string();
+    assert!(message.contains("run.memory"), "{message}");
+    let least = message.split("memory = \"").nth(1).and_then(|t| t.split("MiB").next()).expect("the least is named");
+    let set = format!("run.memory={least}MiB");
+    let (text, plan) = occlude::plan::explain(&parse(dir.path(), text, &[&set])).unwrap();
+    assert!(plan["peak_memory_bytes"].as_u64().unwrap() <= plan["memory_budget_bytes"].as_u64().unwrap(), "{text}");
+}
