@@ -27,8 +27,10 @@ impl Float for f64 {
     }
 }
 
-/// Columns that go through z together: their lines and first tree level stay in L1.
-const COLUMNS: usize = 256;
+/// Columns that go through z together: wide enough for the prefetcher, narrow enough for the tree to stay in L2.
+fn columns(job: &Job) -> usize {
+    if job.needs.variance || job.window[0] > 32 { 64 } else { 256 }
+}
 
 /// Bytes of scratch.
 pub fn bytes<T: Float>(job: &Job) -> usize {
@@ -40,7 +42,7 @@ pub fn bytes<T: Float>(job: &Job) -> usize {
 
 /// Moments on their way through the three axes.
 struct Buffers<'a, A> {
-    /// The tree of one strip of [`COLUMNS`] through z.
+    /// The tree of one strip of [`columns`] through z.
     strip_work: Moments<'a, A>,
     /// Planes of a batch after z.
     planes: Moments<'a, A>,
@@ -56,15 +58,9 @@ impl<'a, A: Sum> Buffers<'a, A> {
     fn lens(job: &Job) -> [usize; 6] {
         let [wz, wy, wx] = job.window;
         let tree = |w: usize, step: usize, len: usize| lines::tree_levels(w) * (len + w * step);
-        let (z, y) = (job.batch * COLUMNS, job.tile[0] * job.pitch);
-        [
-            tree(wz, COLUMNS, z),
-            job.batch * job.plane(),
-            tree(wy, job.pitch, y),
-            y,
-            tree(wx, 1, job.tile[1]),
-            job.tile[1],
-        ]
+        let width = columns(job);
+        let (z, y) = (job.batch * width, job.tile[0] * job.pitch);
+        [tree(wz, width, z), job.batch * job.plane(), tree(wy, job.pitch, y), y, tree(wx, 1, job.tile[1]), job.tile[1]]
     }
 
     fn cut(job: &Job, wanted: Wanted, bytes: &mut &'a mut [u8]) -> Self {
@@ -232,16 +228,17 @@ fn planes_extremes<T: Float>(
 ) {
     let cols = tile.cols.1 - tile.cols.0;
     let plain = Coding { flip: T::default(), missing: T::default() };
-    for j in tile.rows.0..tile.rows.1 {
+    let blocks = (0..job.batch).step_by(job.block);
+    for (j, k) in (tile.rows.0..tile.rows.1).flat_map(|j| blocks.clone().map(move |k| (j, k))) {
         let lines = Lines {
             base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
             pitch: src.plane,
-            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
+            first: (job.at[0] + z0 + k) as isize - job.radius[0] as isize,
             clip: (0, job.src[0] as isize),
         };
-        let out = (tile.span(job, j).start, job.plane());
+        let out = (tile.span(job, j).start + k * job.plane(), job.plane());
         let (w, from) = (job.window[0], [src.data; 2]);
-        blocked(level, job.batch, Masked::<false>, Sources::<false>, from, lines, w, cols, plain, lo, hi, out);
+        blocked(level, job.block, Masked::<false>, Sources::<false>, from, lines, w, cols, plain, lo, hi, out);
     }
 }
 
@@ -257,12 +254,13 @@ fn planes_moments<T: Float>(
 ) where
     Add: Op<T::Total>,
 {
-    let (w, len) = (job.window[0], job.batch * COLUMNS);
-    let (levels, pitch) = (lines::tree_levels(w), len + w * COLUMNS);
+    let width = columns(job);
+    let (w, len) = (job.window[0], job.batch * width);
+    let (levels, pitch) = (lines::tree_levels(w), len + w * width);
     let first = (job.at[0] + z0) as isize - job.radius[0] as isize;
     for j in tile.rows.0..tile.rows.1 {
-        for x in (tile.cols.0..tile.cols.1).step_by(COLUMNS) {
-            let cols = COLUMNS.min(tile.cols.1 - x);
+        for x in (tile.cols.0..tile.cols.1).step_by(width) {
+            let cols = width.min(tile.cols.1 - x);
             let corner = (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2 + x - tile.cols.0;
             // Lines of voxels that exist: the others would add nothing.
             let part = |from: usize, to: usize| {
@@ -271,20 +269,14 @@ fn planes_moments<T: Float>(
             };
             if levels > 0 {
                 for i in 0..job.batch + w - 4 {
-                    join_raw(
-                        level,
-                        wanted,
-                        part(i, i + 4),
-                        &mut b.strip_work.part(i * COLUMNS..i * COLUMNS + cols),
-                        false,
-                    );
+                    join_raw(level, wanted, part(i, i + 4), &mut b.strip_work.part(i * width..i * width + cols), false);
                 }
-                grow(level, wanted, 2, None, w, COLUMNS, len, &mut b.strip_work);
+                grow(level, wanted, 2, None, w, width, len, &mut b.strip_work);
             }
             for k in 0..job.batch {
                 let start = k * job.plane() + j * job.pitch + x;
                 let out = &mut b.planes.part(start..start + cols);
-                let done = gather(level, wanted, None, w, COLUMNS, pitch, k * COLUMNS, out, &b.strip_work);
+                let done = gather(level, wanted, None, w, width, pitch, k * width, out, &b.strip_work);
                 join_raw(level, wanted, part(k + done, k + w), out, done > 0);
             }
         }

@@ -151,7 +151,7 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
         + Moment::<u32, u32, u32>::bytes(job, masked)
-        + padded::<u32>(job.tile[1])
+        + 2 * padded::<u32>(job.tile[1])
 }
 
 /// What becomes of a code in a running sum.
@@ -310,11 +310,15 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let mut s2 = Moment::<Z2, Y2, X2>::cut(job, needs.variance, bytes);
     let mut count = Moment::<u32, u32, u32>::cut(job, M, bytes);
     let n = cut::<u32>(bytes, job.tile[1]);
+    let columns = cut::<u32>(bytes, job.tile[1]);
     let coding = Coding { flip, missing: missing.unwrap_or_default() };
     let plain = Coding { flip: T::default(), missing: T::default() };
     let width = Width::of(job.counts().0, T::TOP);
     for tile in Tile::all(job) {
         let (y, x) = (tile.y, tile.x);
+        for (i, c) in columns[..tile.size[1]].iter_mut().enumerate() {
+            *c = job.count(2, x + i) as u32;
+        }
         lo.fill(T::GREATEST);
         hi.fill(T::LEAST);
         s1.plane.fill(Z1::default());
@@ -356,13 +360,8 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                 let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
                 let old = (first + z).checked_sub(reach + 1);
                 slide_in(new, old, &mut s1, &mut s2, &mut count);
-                if !M {
-                    let section = job.count(0, z);
-                    for (i, n) in n[..tile.size[1]].iter_mut().enumerate() {
-                        *n = (section * job.count(2, x + i)) as u32; // times the rows, below
-                    }
-                }
-                let mut rows_counted = 1;
+                let section = job.count(0, z);
+                let mut rows_counted = 0;
                 if needs.mean {
                     s1.begin_rows(level, job);
                 }
@@ -395,7 +394,8 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                     } else {
                         let rows = job.count(1, y + j);
                         if rows != rows_counted {
-                            n.iter_mut().for_each(|n| *n = *n / rows_counted as u32 * rows as u32);
+                            let section = (section * rows) as u32;
+                            n[..tile.size[1]].iter_mut().zip(&*columns).for_each(|(n, c)| *n = section * c);
                             rows_counted = rows;
                         }
                     }

@@ -158,14 +158,6 @@ impl<'a, A: Sum> Moments<'a, A> {
         self.n.fill(0.0);
         self.i.fill(0.0);
     }
-
-    /// Copies what `from` holds.
-    pub fn copy_from(&mut self, from: &Moments<A>) {
-        self.s.copy_from_slice(from.s);
-        self.m.copy_from_slice(from.m);
-        self.n.copy_from_slice(from.n);
-        self.i.copy_from_slice(from.i);
-    }
 }
 
 /// Which moments a pass carries besides the sum.

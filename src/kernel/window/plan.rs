@@ -9,12 +9,14 @@ pub struct Needs {
     pub extremes: bool,
     pub mean: bool,
     pub variance: bool,
+    /// The input is a float type.
+    pub float: bool,
 }
 
 impl Needs {
     /// For integers an exact variance of zero says that a window is constant; floats ask the extremes.
     pub fn of(channels: impl Iterator<Item = WindowChannel>, float: bool) -> Needs {
-        let mut needs = Needs { extremes: false, mean: false, variance: false };
+        let mut needs = Needs { extremes: false, mean: false, variance: false, float };
         for channel in channels {
             match channel {
                 WindowChannel::Mean => needs.mean = true,
@@ -48,8 +50,10 @@ pub struct Job {
     pub needs: Needs,
     /// Output rows and columns of a tile.
     pub tile: [usize; 2],
-    /// Output planes whose extremes are made together.
+    /// Output planes that go through z together, a multiple of `block`.
     pub batch: usize,
+    /// Output planes whose extremes are made together.
+    pub block: usize,
     /// Output rows whose extremes are made together.
     pub rows: usize,
     /// Elements from row to row of tile buffers.
@@ -65,12 +69,34 @@ impl Job {
         let window = radius.map(|r| 2 * r + 1);
         let width = even(dst[2], MAX_WIDTH);
         let pitch = odd_lines(width + 2 * radius[2]);
-        let batch = block(window[0], dst[0]);
+        let planes = block(window[0], dst[0]);
+        // Each batch makes the lower levels of the float trees anew, so long windows want deep batches.
+        let deep = if !needs.float || window[0] <= 32 {
+            1
+        } else if needs.variance {
+            2
+        } else {
+            4
+        };
+        let batch = planes * deep.min(dst[0].div_ceil(planes));
         let rows =
             (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
         let tile = [even(dst[1], rows), width];
         let height = tile[0] + 2 * radius[1];
-        Job { src, dst, at, radius, window, needs, tile, batch, rows: block(window[1], tile[0]), pitch, height }
+        Job {
+            src,
+            dst,
+            at,
+            radius,
+            window,
+            needs,
+            tile,
+            batch,
+            block: planes,
+            rows: block(window[1], tile[0]),
+            pitch,
+            height,
+        }
     }
 
     /// Most voxels in a window, and in its z-y section.
