@@ -6,7 +6,7 @@
 //! taps of each blurred cell, and the two blurred cells, are renormalised to what is valid.
 
 use super::Context;
-use super::values::{BLOCK, blocks, load_any};
+use super::values::{blocks, load_any};
 use crate::brick::scratch::{cut, padded};
 use crate::grid::{Affine, AnyView, Region, Shape};
 use crate::multiversion;

@@ -6,6 +6,7 @@
 //! counted in integers, so nothing depends on brick, order or instruction set.
 
 mod compare;
+mod slide;
 mod vector;
 
 use super::Context;
@@ -42,6 +43,12 @@ pub fn rank(
         }};
     }
     match src {
+        AnyView::U8(v) if plan.slides() => {
+            slide_all(cx.level, v, missing_as(params.missing), flipped, &plan, bytes, dst);
+        }
+        AnyView::I8(v) if plan.slides() => {
+            slide_all(cx.level, v, missing_as(params.missing), flipped, &plan, bytes, dst);
+        }
         AnyView::U8(v) => run!(v, i8, 64),
         AnyView::I8(v) => run!(v, i8, 64),
         AnyView::U16(v) => run!(v, i16, 32),
@@ -64,7 +71,8 @@ pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams
         4 => padded::<i32>(voxels),
         _ => padded::<f64>(voxels),
     };
-    keys + padded::<i8>(voxels)
+    let columns = if dtype.size() == 1 { padded::<u16>(slide::columns(&plan)) } else { 0 };
+    keys + padded::<i8>(voxels) + columns
 }
 
 /// Where windows lie: all that does not depend on the element type.
@@ -81,6 +89,9 @@ struct Plan {
     /// Keys of a padded row: the radius, the output box in whole vectors, the radius.
     width: usize,
 }
+
+/// Voxels of a window from which sliding histograms are used. SLIDE_NOTE
+const SLIDE_FROM: usize = 4000;
 
 /// Most lanes of any key type; rows are padded to it.
 const MOST_LANES: usize = 64;
@@ -104,6 +115,14 @@ impl Plan {
         }
         let (rz, ry) = (self.radius[0] as i64, self.radius[1] as i64);
         self.reach[((dz + rz) * (2 * ry + 1) + dy + ry) as usize].map(|r| r as usize)
+    }
+
+    /// Whether sliding histograms are the faster way for keys of 8 bits: they cost about the same for every radius, while
+    /// comparing grows with the window.
+    fn slides(&self) -> bool {
+        let window: [usize; 3] = self.radius.map(|r| 2 * r + 1);
+        let rows = window[0] * window[1];
+        self.reach.is_empty() && rows * window[2] > SLIDE_FROM && rows <= usize::from(u16::MAX)
     }
 
     /// First and last row (or plane) of the window about row `i` of the output box, in voxels of the source.
@@ -277,29 +296,62 @@ fn count_all<T: ToKey<K>, K: Key, const L: usize>(
             for x in (0..plan.dst[2]).step_by(MOST_LANES) {
                 compare::count::<K, L>(level, keys, valid, plan, [z, y, x], rows, &mut counts);
                 for (j, counts) in counts[..rows].iter().enumerate() {
-                    let n = MOST_LANES.min(plan.dst[2] - x);
-                    let centres = &src.row_at(plan.at[0] + z, plan.at[1] + y + j)[plan.at[2] + x..][..n];
-                    let openness = |i: usize| {
-                        if gone(centres[i], missing) {
-                            f64::NAN
-                        } else {
-                            counts.openness(i, centres[i].key(flipped), plan.ties)
-                        }
-                    };
-                    match &mut dst {
-                        AnyViewMut::F32(d) => {
-                            let row = &mut d.row_at(z, y + j)[x..x + n];
-                            row.iter_mut().enumerate().for_each(|(i, d)| *d = openness(i) as f32);
-                        }
-                        AnyViewMut::F64(d) => {
-                            let row = &mut d.row_at(z, y + j)[x..x + n];
-                            row.iter_mut().enumerate().for_each(|(i, d)| *d = openness(i));
-                        }
-                        other => unreachable!("an openness of type {}", other.dtype()),
-                    }
+                    write(&src, missing, flipped, plan, [z, y + j, x], counts, &mut dst);
                 }
             }
         }
+    }
+}
+
+/// Counts by histograms that slide, for types of 8 bits and box windows.
+fn slide_all<T: ToKey<i8>>(
+    level: super::simd::Level,
+    src: View<T>,
+    missing: Option<T>,
+    flipped: bool,
+    plan: &Plan,
+    bytes: &mut [u8],
+    mut dst: AnyViewMut,
+) {
+    let voxels = plan.src[0] * plan.src[1] * plan.width;
+    let (keys, bytes) = cut::<i8>(bytes, voxels);
+    let (valid, bytes) = cut::<i8>(bytes, voxels);
+    let (columns, _) = cut::<u16>(bytes, slide::columns(plan));
+    let any_missing = fill_keys(&src, missing, flipped, plan, keys, valid);
+    let valid: Option<&[i8]> = any_missing.then_some(valid);
+    for z in 0..plan.dst[0] {
+        for y in 0..plan.dst[1] {
+            slide::move_columns(level, keys, valid, plan, [z, y], columns);
+            let mut window = slide::Window::default();
+            let mut counts = Counts::default();
+            for x in (0..plan.dst[2]).step_by(MOST_LANES) {
+                slide::count(level, keys, plan, [z, y, x], columns, &mut window, &mut counts);
+                write(&src, missing, flipped, plan, [z, y, x], &counts, &mut dst);
+            }
+        }
+    }
+}
+
+/// Writes the openness of up to [`MOST_LANES`] voxels of an output row from `[z, y, x]` on.
+fn write<T: ToKey<K>, K: Key>(
+    src: &View<T>,
+    missing: Option<T>,
+    flipped: bool,
+    plan: &Plan,
+    [z, y, x]: [usize; 3],
+    counts: &Counts,
+    dst: &mut AnyViewMut,
+) {
+    let n = MOST_LANES.min(plan.dst[2] - x);
+    let centres = &src.row_at(plan.at[0] + z, plan.at[1] + y)[plan.at[2] + x..][..n];
+    let openness = |(i, v): (usize, &T)| {
+        if gone(*v, missing) { f64::NAN } else { counts.openness(i, v.key(flipped), plan.ties) }
+    };
+    let values = centres.iter().enumerate().map(openness);
+    match dst {
+        AnyViewMut::F32(d) => d.row_at(z, y)[x..x + n].iter_mut().zip(values).for_each(|(d, v)| *d = v as f32),
+        AnyViewMut::F64(d) => d.row_at(z, y)[x..x + n].iter_mut().zip(values).for_each(|(d, v)| *d = v),
+        other => unreachable!("an openness of type {}", other.dtype()),
     }
 }
 

@@ -5,14 +5,14 @@ use super::Key;
 use crate::kernel::simd::Level;
 
 /// Counts per lane, written over from zero: keys above the centre, and keys not below it (`MID` only).
-pub(super) struct Lanes<'a, K: Key, const L: usize, const R: usize> {
+pub(crate) struct Lanes<'a, K: Key, const L: usize, const R: usize> {
     pub above: &'a mut [[K::Count; L]; R],
     pub not_below: &'a mut [[K::Count; L]; R],
 }
 
 /// A block of the padded keys: `rows` rows, `stride` apart, of `shifts` runs of L keys each, from the slice's start.
 #[derive(Clone, Copy)]
-pub(super) struct Block<'a, K> {
+pub(crate) struct Block<'a, K> {
     pub keys: &'a [K],
     pub stride: usize,
     pub rows: usize,
