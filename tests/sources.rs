@@ -4,7 +4,7 @@
 mod common_sources;
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use common_sources::*;
 use occlude::brick::Voxels;
@@ -12,33 +12,6 @@ use occlude::config::{Input, InputKind, RawFormat, Select};
 use occlude::grid::{DType, Region};
 use occlude::store::Source;
 use occlude::store::source::ChunkRead;
-
-/// The fixtures hold `z * 40 + y * 7 + x + 100 * component`.
-fn expected(shape: [usize; 3], component: usize) -> impl Fn(usize) -> f64 {
-    move |i| {
-        let (z, y, x) = (i / (shape[1] * shape[2]), i / shape[2] % shape[1], i % shape[2]);
-        (z * 40 + y * 7 + x + 100 * component) as f64
-    }
-}
-
-/// Opens, prepares and checks a fixture of 4 x 5 x 6 voxels, in whole and in a box.
-fn check(input: &Input, component: usize, value: usize) -> Source {
-    let (source, voxels) = whole(input, component).unwrap_or_else(|e| panic!("{}: {e}", input.name));
-    assert_eq!(source.info().shape, [4, 5, 6], "{}", input.name);
-    let wrap = |v: f64| if voxels.dtype() == DType::U8 { v % 256.0 } else { v };
-    for i in 0..voxels.len() {
-        assert_eq!(voxels.at(i), wrap(expected([4, 5, 6], value)(i)), "{} voxel {i}", input.name);
-    }
-    let region = Region::new([1, 2, 1], [4, 4, 6]);
-    let mut part = Voxels::zeroed(source.info().dtype, region.voxels());
-    source.read(component, region, part.view_mut(region.shape())).unwrap();
-    for (i, [z, y, x]) in region.iter().enumerate() {
-        assert_eq!(part.at(i), wrap((z * 40 + y * 7 + x) as f64 + 100.0 * value as f64), "{} box", input.name);
-    }
-    source.release(Region::whole([4, 5, 6]));
-    assert_eq!(source.identity().unwrap(), Source::open(input).unwrap().identity().unwrap());
-    source
-}
 
 #[test]
 fn nifti_of_each_type_and_byte_order() {
@@ -212,6 +185,20 @@ fn ome_zarr_levels_channels_times_and_placement() {
     input.array = Some("7".into());
     let e = Source::open(&input).unwrap_err().to_string();
     assert!(e.contains("it has: 0"), "{e}");
+}
+
+#[test]
+fn synthetic_fields_open_by_name() {
+    let kind = |field: &str, shape| InputKind::Synthetic { field: field.into(), shape, dtype: DType::U8, seed: 1 };
+    let input = Input { kind: kind("ramp", [2, 3, 256]), ..fixture("ramp") };
+    let (source, voxels) = whole(&input, 0).unwrap();
+    assert_eq!((source.info().shape, source.info().chunk), ([2, 3, 256], None));
+    assert!((0..1536).all(|i| voxels.at(i) == (i % 256) as f64));
+    assert_ne!(source.identity().unwrap(), Source::from_array([1, 1, 1], Voxels::U8(vec![0])).identity().unwrap());
+    for (field, shape, word) in [("blob", [4, 4, 4], "sphere, plane"), ("sphere", [0, 4, 4], "at least 1 voxel")] {
+        let e = Source::open(&Input { kind: kind(field, shape), ..fixture("x") }).unwrap_err();
+        assert!(e.exit_code() == 2 && e.to_string().contains(word), "{e}");
+    }
 }
 
 #[test]
@@ -512,25 +499,4 @@ fn published_volumes_have_the_right_voxels() {
         seen += 1;
     }
     assert!(seen > 0, "the folder of published volumes is there but empty");
-}
-
-/// As `check`, for types in which the values wrap around.
-fn check_wrapped(input: &Input) -> Source {
-    let (source, voxels) = whole(input, 0).unwrap_or_else(|e| panic!("{}: {e}", input.name));
-    for i in 0..voxels.len() {
-        let v = expected([4, 5, 6], 0)(i);
-        let v = if voxels.dtype() == DType::I8 { v as i64 as i8 as f64 } else { v };
-        assert_eq!(voxels.at(i), v, "{} voxel {i}", input.name);
-    }
-    source
-}
-
-fn shared_data() -> Option<PathBuf> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    // Beside the repository, or one folder further up from a worktree.
-    let found = ["../shared/data", "../../shared/data"].into_iter().map(|f| root.join(f)).find(|f| f.is_dir());
-    if found.is_none() {
-        eprintln!("skipped: the published volumes are not at {}", root.join("../shared/data").display());
-    }
-    found
 }

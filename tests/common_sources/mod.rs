@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use occlude::brick::Voxels;
 use occlude::config::{Input, InputKind, Place, RawFormat, Select};
-use occlude::grid::Region;
+use occlude::grid::{DType, Region};
 use occlude::store::Source;
 
 pub fn data(name: &str) -> PathBuf {
@@ -72,6 +72,54 @@ pub fn copy_tree(from: &Path, to: &Path) {
             std::fs::copy(entry.path(), target).unwrap();
         }
     }
+}
+
+/// The fixtures hold `z * 40 + y * 7 + x + 100 * component`.
+pub fn expected(shape: [usize; 3], component: usize) -> impl Fn(usize) -> f64 {
+    move |i| {
+        let (z, y, x) = (i / (shape[1] * shape[2]), i / shape[2] % shape[1], i % shape[2]);
+        (z * 40 + y * 7 + x + 100 * component) as f64
+    }
+}
+
+/// Opens, prepares and checks a fixture of 4 x 5 x 6 voxels, in whole and in a box.
+pub fn check(input: &Input, component: usize, value: usize) -> Source {
+    let (source, voxels) = whole(input, component).unwrap_or_else(|e| panic!("{}: {e}", input.name));
+    assert_eq!(source.info().shape, [4, 5, 6], "{}", input.name);
+    let wrap = |v: f64| if voxels.dtype() == DType::U8 { v % 256.0 } else { v };
+    for i in 0..voxels.len() {
+        assert_eq!(voxels.at(i), wrap(expected([4, 5, 6], value)(i)), "{} voxel {i}", input.name);
+    }
+    let region = Region::new([1, 2, 1], [4, 4, 6]);
+    let mut part = Voxels::zeroed(source.info().dtype, region.voxels());
+    source.read(component, region, part.view_mut(region.shape())).unwrap();
+    for (i, [z, y, x]) in region.iter().enumerate() {
+        assert_eq!(part.at(i), wrap((z * 40 + y * 7 + x) as f64 + 100.0 * value as f64), "{} box", input.name);
+    }
+    source.release(Region::whole([4, 5, 6]));
+    assert_eq!(source.identity().unwrap(), Source::open(input).unwrap().identity().unwrap());
+    source
+}
+
+/// As `check`, for types in which the values wrap around.
+pub fn check_wrapped(input: &Input) -> Source {
+    let (source, voxels) = whole(input, 0).unwrap_or_else(|e| panic!("{}: {e}", input.name));
+    for i in 0..voxels.len() {
+        let v = expected([4, 5, 6], 0)(i);
+        let v = if voxels.dtype() == DType::I8 { v as i64 as i8 as f64 } else { v };
+        assert_eq!(voxels.at(i), v, "{} voxel {i}", input.name);
+    }
+    source
+}
+
+pub fn shared_data() -> Option<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    // Beside the repository, or one folder further up from a worktree.
+    let found = ["../shared/data", "../../shared/data"].into_iter().map(|f| root.join(f)).find(|f| f.is_dir());
+    if found.is_none() {
+        eprintln!("skipped: the published volumes are not at {}", root.join("../shared/data").display());
+    }
+    found
 }
 
 /// SHA-256, as the published checksums are (FIPS 180-4).
