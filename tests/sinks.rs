@@ -83,7 +83,9 @@ fn occlude() -> Value {
 
 fn write_levels(sink: &Sink) {
     for level in 0..sink.spec().pyramid.levels.len() {
-        let step = if sink.spec().is_zarr() { sink.spec().file_shape() } else { sink.spec().chunk };
+        // As tasks do: whole shards, several chunk files at once.
+        let file = if sink.spec().is_zarr() { sink.spec().file_shape() } else { sink.spec().chunk };
+        let step = std::array::from_fn(|a| [16usize, 16, 32][a].next_multiple_of(file[a]));
         for file in pieces(sink.spec(), level, step) {
             put_region(sink, level, file);
             sink.commit(level, file).unwrap();
@@ -138,11 +140,11 @@ fn zarrs_reads_back_every_type_codec_and_layout() {
     let folder = tempfile::tempdir().unwrap();
     let codecs = [Codec::BloscLz4, Codec::Zstd(1), Codec::None];
     for (i, format) in ZARR.into_iter().enumerate() {
-        for dtype in DType::ALL {
+        for (d, dtype) in DType::ALL.into_iter().enumerate() {
             for (k, codec) in codecs.into_iter().enumerate() {
-                // Every layout with some type, every type with some layout: syncing files is what costs time here.
+                // Every layout and codec with u8, every type with some of them: syncing files is what costs time here.
                 let layouts = [Some([16, 16, 32]), None, Some([8; 3]), Some([64; 3])];
-                let some = |j: &usize| (dtype.size() + i + k + j).is_multiple_of(4) || dtype == DType::U8;
+                let some = |j: &usize| dtype == DType::U8 || (*j == d % 4 && k == d % 3);
                 for (j, shard) in layouts.into_iter().enumerate().filter(|(j, _)| some(j)) {
                     let path = folder.path().join(format!("{i}-{dtype}-{k}-{j}.zarr"));
                     let spec = SinkSpec { codec, shard, ..spec(path, format, dtype, [17, 9, 35]) };

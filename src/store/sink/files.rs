@@ -22,9 +22,9 @@ pub fn cannot_write(path: &Path, error: io::Error) -> Error {
     }
 }
 
-/// Beyond so many single syncs, one of the whole file system is cheaper (0.3 ms a file and 0.1 ms a folder against
-/// 1.8 ms, ext4, 2-core Zen 4 VM, 2026-11-23; many times that on a busy disk, where each waits for the journal).
-const SINGLE_SYNCS: usize = 6;
+/// Beyond so many single syncs, one of the whole file system is cheaper: a file takes 0.3 ms, a folder 0.1 ms, everything
+/// 1.8 ms on a quiet disk, and 3.6 ms either way on a busy one (ext4, 2-core Zen 4 VM, 2026-11-23).
+const SINGLE_SYNCS: usize = 3;
 
 /// Makes entries of folders (new names, renames) durable.
 pub fn sync_dirs(dirs: &BTreeSet<PathBuf>) -> Result<()> {
