@@ -7,7 +7,7 @@
 use super::contribute;
 use super::keys::{Key, LANES, Volume};
 use super::lines::{Family, displacement};
-use super::scan::{self, Hit, Sheet};
+use super::scan::{self, Hit, Sheet, Spans};
 use super::sinks::{Piece, Sink, Visit};
 use crate::grid::Region;
 use crate::kernel::simd::Level;
@@ -172,8 +172,9 @@ fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2],
                 (Piece { at, axis: a }, start)
             };
             queries.clone().for_each(|plane| sink.expect(visit, &piece_of(plane).0));
+            let spans = spans(&shift_c[queries.clone()], s_c, tile);
             let asked = answers.each_mut().map(|a| &mut **a);
-            scan::both(level, sheet, local, visit.reach, asked, room.rows, room.stack, room.turned);
+            scan::both(level, sheet, &spans, local, visit.reach, asked, room.rows, room.stack, room.turned);
             for (row, plane) in queries.enumerate() {
                 let (piece, start) = piece_of(plane);
                 let (lo, hi) = (piece.at[2], (start + LANES as i64).min(tile.hi[2]));
@@ -187,6 +188,20 @@ fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2],
             }
         }
     }
+}
+
+/// The planes of each lane that lie inside the tile.
+fn spans(shift_c: &[i32], s_c: i64, tile: &Region) -> Spans {
+    let (least, most) = span(shift_c);
+    let mut spans = [[0, shift_c.len() as u32]; LANES];
+    if s_c + least >= tile.lo[2] && s_c + most + LANES as i64 <= tile.hi[2] {
+        return spans;
+    }
+    for (lane, span) in spans.iter_mut().enumerate() {
+        let inside = planes_inside(shift_c, 0..shift_c.len(), s_c + lane as i64, tile.lo[2], tile.hi[2]);
+        *span = [inside.start as u32, inside.end as u32];
+    }
+    spans
 }
 
 /// Finds the planes of a sheet from plane `first` on; what lies outside of the source is at 0, where zeros stand.

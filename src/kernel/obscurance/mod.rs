@@ -79,7 +79,7 @@ pub struct ObscuranceIo<'a> {
 }
 
 /// Output voxels whose sums are kept at once, `[z, y, x]`: they stay in the third-level cache while all families pass.
-const TILE: Shape = [128, 128, 256];
+const TILE: Shape = [256, 128, 256];
 
 impl Prepared {
     /// Panics on a spacing or distance that is not positive.

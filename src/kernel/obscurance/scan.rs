@@ -85,6 +85,9 @@ fn stacked<K: Key, H: Hit>(
     }
 }
 
+/// For each lane the queries that are wanted, from and to, counted from the first; answers of others may be anything.
+pub(super) type Spans = [[u32; 2]; LANES];
+
 /// Planes of 64 keys, where they stand in a padded volume.
 #[derive(Clone, Copy)]
 pub(super) struct Sheet<'a, K> {
@@ -114,6 +117,7 @@ const BRUTE: usize = 768;
 pub(super) fn both<K: Key, H: Hit>(
     level: Level,
     sheet: Sheet<K>,
+    spans: &Spans,
     queries: Range<usize>,
     reach: usize,
     hits: [&mut [H]; 2],
@@ -125,9 +129,9 @@ pub(super) fn both<K: Key, H: Hit>(
     if level == Level::Avx512 && size_of::<H>() == 1 {
         let hits = hits.map(H::bytes);
         // SAFETY: the level says that the CPU has AVX-512.
-        return unsafe { super::wide::next_greater(sheet, queries, reach, hits, turned) };
+        return unsafe { super::wide::next_greater(sheet, spans, queries, reach, hits, turned) };
     }
-    let _ = turned;
+    let _ = (turned, spans);
     let rows = &mut rows[..sheet.planes.len() * LANES];
     sheet.copy_to(rows);
     for (way, hits) in hits.into_iter().enumerate() {

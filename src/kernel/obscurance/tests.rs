@@ -137,6 +137,7 @@ fn every_search_finds_the_next_greater_key() {
             let place = super::scan::Sheet { data: &sheet, planes: &starts };
             let mut stack = vec![0; planes];
             let mut rows = sheet.clone();
+            let spans = [[0, (to - from) as u32]; LANES];
             #[cfg(target_arch = "x86_64")]
             let mut scratch = vec![0u64; super::wide::scratch_bytes(planes, to - from, size_of::<K>()) / 8 + 8];
             for level in Level::available() {
@@ -152,6 +153,7 @@ fn every_search_finds_the_next_greater_key() {
                     super::scan::both(
                         level,
                         place,
+                        &spans,
                         from..to,
                         reach,
                         [f, b],
@@ -164,7 +166,7 @@ fn every_search_finds_the_next_greater_key() {
                     }
                 } else {
                     let [f, b] = hits.each_mut();
-                    super::scan::both(level, place, from..to, reach, [f, b], &mut rows, &mut stack, &mut []);
+                    super::scan::both(level, place, &spans, from..to, reach, [f, b], &mut rows, &mut stack, &mut []);
                 }
                 for (ahead, hits) in [true, false].into_iter().zip(&hits) {
                     for (i, &got) in hits.iter().enumerate() {

@@ -10,7 +10,7 @@ use std::arch::x86_64::*;
 use std::ops::Range;
 
 use super::keys::{Key, LANES};
-use super::scan::Sheet;
+use super::scan::{Sheet, Spans};
 
 /// Longest reach whose answers fit into the bytes that are turned back.
 pub(super) const MAX_REACH: usize = u8::MAX as usize;
@@ -33,6 +33,7 @@ pub(super) fn scratch_bytes(planes: usize, queries: usize, size: usize) -> usize
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,avx2,bmi1,bmi2,lzcnt,popcnt")]
 pub(super) unsafe fn next_greater<K: Key>(
     sheet: Sheet<K>,
+    spans: &Spans,
     queries: Range<usize>,
     reach: usize,
     hits: [&mut [u8]; 2],
@@ -48,26 +49,30 @@ pub(super) unsafe fn next_greater<K: Key>(
     // SAFETY: `Key` is implemented for these four types only, told apart by their size; extents were checked above.
     unsafe {
         match size_of::<K>() {
-            1 => keys_u8(data.cast(), starts, queries, reach, hits, scratch),
-            2 => keys_u16(data.cast(), starts, queries, reach, hits, scratch),
-            4 => keys_u32(data.cast(), starts, queries, reach, hits, scratch),
-            _ => keys_u64(data.cast(), starts, queries, reach, hits, scratch),
+            1 => keys_u8(data.cast(), starts, spans, queries, reach, hits, scratch),
+            2 => keys_u16(data.cast(), starts, spans, queries, reach, hits, scratch),
+            4 => keys_u32(data.cast(), starts, spans, queries, reach, hits, scratch),
+            _ => keys_u64(data.cast(), starts, spans, queries, reach, hits, scratch),
         }
     }
 }
 
 /// 16 x 16 bytes turned inside each 128-bit lane: each round rotates the address (4 bits of row, 4 of column) by one.
 #[target_feature(enable = "avx512f,avx512bw")]
-fn turn_bytes(mut t: [__m512i; 16]) -> [__m512i; 16] {
-    for _ in 0..4 {
-        let mut n = [_mm512_setzero_si512(); 16];
-        for i in 0..8 {
-            n[2 * i] = _mm512_unpacklo_epi8(t[i], t[i + 8]);
-            n[2 * i + 1] = _mm512_unpackhi_epi8(t[i], t[i + 8]);
-        }
-        t = n;
+#[inline]
+fn turn_bytes(t: [__m512i; 16]) -> [__m512i; 16] {
+    round(round(round(round(t))))
+}
+
+#[target_feature(enable = "avx512f,avx512bw")]
+#[inline]
+fn round(t: [__m512i; 16]) -> [__m512i; 16] {
+    let mut n = t;
+    for i in 0..8 {
+        n[2 * i] = _mm512_unpacklo_epi8(t[i], t[i + 8]);
+        n[2 * i + 1] = _mm512_unpackhi_epi8(t[i], t[i + 8]);
     }
-    t
+    n
 }
 
 /// Turns answers `[line][query]` (rows of `stride` bytes) into rows of 64 lines per query.
@@ -104,7 +109,7 @@ unsafe fn turn_back(answers: *const u8, stride: usize, count: usize, hits: &mut 
 
 macro_rules! search {
     (
-        $name:ident, $t:ty, levels $levels:literal, group $group:literal, rounds $rounds:literal,
+        $name:ident, $t:ty, levels $levels:literal, group $group:literal, rounds [$($round:ident)*],
         $unpacklo:ident, $unpackhi:ident, $permute:ident, $max:ident, $min:ident, $set1:ident, $add:ident, $sub:ident,
         $le:ident, $mask_gt:ident, $mask_add:ident, $blend:ident, $mask:ty, $lane_type:ty, $store:expr
     ) => {
@@ -114,6 +119,7 @@ macro_rules! search {
         unsafe fn $name(
             data: *const $t,
             starts: &[usize],
+            spans: &Spans,
             queries: Range<usize>,
             reach: usize,
             hits: [&mut [u8]; 2],
@@ -129,7 +135,6 @@ macro_rules! search {
             let front = queries.start.div_ceil(R);
             let blocks = front + (planes - queries.start).div_ceil(R);
             let stride = (blocks | 1) * R;
-            let query_blocks = queries.len().div_ceil(R);
             let answer_stride = (queries.len().div_ceil(64) | 1) * 64;
             let (lines, rest) = scratch.split_at_mut(LANES * stride * size_of::<$t>());
             let (tables, rest) = rest.split_at_mut((blocks + 2) * LEVELS * 64);
@@ -154,14 +159,13 @@ macro_rules! search {
                             _mm_prefetch::<_MM_HINT_T0>(data.wrapping_add(start + 2 * LANES + column * R).cast());
                         }
                     }
-                    for _ in 0..$rounds {
-                        let mut n = [zero; GROUP];
+                    $({
+                        let $round = t;
                         for i in 0..GROUP / 2 {
-                            n[2 * i] = $unpacklo(t[i], t[i + GROUP / 2]);
-                            n[2 * i + 1] = $unpackhi(t[i], t[i + GROUP / 2]);
+                            t[2 * i] = $unpacklo($round[i], $round[i + GROUP / 2]);
+                            t[2 * i + 1] = $unpackhi($round[i], $round[i + GROUP / 2]);
                         }
-                        t = n;
-                    }
+                    })*
                     for (c, &v) in t.iter().enumerate() {
                         let quarters = [
                             _mm512_castsi512_si128(v),
@@ -198,7 +202,15 @@ macro_rules! search {
             unsafe { *tops.add(blocks + 1) = 0 };
             for line in 0..LANES {
                 let mut next = [zero; LEVELS];
-                for block in (0..=blocks).rev() {
+                let [from, to] = spans[line].map(|query| query as usize);
+                if from >= to {
+                    continue;
+                }
+                let asked = from / R..to.min(queries.len()).div_ceil(R);
+                let around = reach.div_ceil(R);
+                let lowest = (front + asked.start + 1).saturating_sub(around);
+                let highest = (front + asked.end + around).min(blocks);
+                for block in (lowest..=highest).rev() {
                     let mut t = zero;
                     if block > 0 {
                         // SAFETY: one of the blocks of the line.
@@ -220,7 +232,7 @@ macro_rules! search {
                         *tops.add(block) = (*last).max(*last.add(R / 2));
                     }
                 }
-                for q in 0..query_blocks {
+                for q in asked {
                     let home = front + q + 1; // in tables
                     let key = table(home, 0);
                     // SAFETY: tables and tops of a block and its neighbour.
@@ -228,8 +240,8 @@ macro_rules! search {
                     if !hits[0].is_empty() {
                         let mut answer = limit;
                         let mut open: $mask = !0;
-                        for k in 0..=blocks - home {
-                            if k * R >= reach {
+                        for k in 0..(blocks - home + 1).min(around) {
+                            if k > 0 && open == 0 {
                                 break;
                             }
                             let (near, far) = (home + k, home + k + 1);
@@ -245,9 +257,6 @@ macro_rules! search {
                             let steps = $add($sub(at, $add(lane, one)), number(k * R));
                             answer = $blend(found, answer, steps);
                             open &= !found;
-                            if open == 0 {
-                                break;
-                            }
                         }
                         // SAFETY: R bytes of the row of this line.
                         unsafe {
@@ -257,8 +266,8 @@ macro_rules! search {
                     if !hits[1].is_empty() {
                         let mut answer = limit;
                         let mut open: $mask = !0;
-                        for k in 0..home {
-                            if k * R >= reach {
+                        for k in 0..home.min(around) {
+                            if k > 0 && open == 0 {
                                 break;
                             }
                             let (far, near) = (home - k - 1, home - k);
@@ -276,9 +285,6 @@ macro_rules! search {
                             let steps = $add($sub($add(lane, past), at), number(k * R));
                             answer = $blend(found, answer, steps);
                             open &= !found;
-                            if open == 0 {
-                                break;
-                            }
                         }
                         // SAFETY: as above.
                         unsafe {
@@ -298,28 +304,28 @@ macro_rules! search {
 }
 
 search!(
-    keys_u8, u8, levels 6, group 16, rounds 4,
+    keys_u8, u8, levels 6, group 16, rounds [a b c d],
     _mm512_unpacklo_epi8, _mm512_unpackhi_epi8, _mm512_permutex2var_epi8, _mm512_max_epu8, _mm512_min_epu8,
     _mm512_set1_epi8, _mm512_add_epi8, _mm512_sub_epi8, _mm512_cmple_epu8_mask, _mm512_mask_cmpgt_epu8_mask,
     _mm512_mask_add_epi8, _mm512_mask_blend_epi8, u64, i8,
     |to: *mut u8, v| _mm512_storeu_si512(to.cast(), v)
 );
 search!(
-    keys_u16, u16, levels 5, group 8, rounds 3,
+    keys_u16, u16, levels 5, group 8, rounds [a b c],
     _mm512_unpacklo_epi16, _mm512_unpackhi_epi16, _mm512_permutex2var_epi16, _mm512_max_epu16, _mm512_min_epu16,
     _mm512_set1_epi16, _mm512_add_epi16, _mm512_sub_epi16, _mm512_cmple_epu16_mask, _mm512_mask_cmpgt_epu16_mask,
     _mm512_mask_add_epi16, _mm512_mask_blend_epi16, u32, i16,
     |to: *mut u8, v| _mm256_storeu_si256(to.cast(), _mm512_cvtepi16_epi8(v))
 );
 search!(
-    keys_u32, u32, levels 4, group 4, rounds 2,
+    keys_u32, u32, levels 4, group 4, rounds [a b],
     _mm512_unpacklo_epi32, _mm512_unpackhi_epi32, _mm512_permutex2var_epi32, _mm512_max_epu32, _mm512_min_epu32,
     _mm512_set1_epi32, _mm512_add_epi32, _mm512_sub_epi32, _mm512_cmple_epu32_mask, _mm512_mask_cmpgt_epu32_mask,
     _mm512_mask_add_epi32, _mm512_mask_blend_epi32, u16, i32,
     |to: *mut u8, v| _mm_storeu_si128(to.cast(), _mm512_cvtepi32_epi8(v))
 );
 search!(
-    keys_u64, u64, levels 3, group 2, rounds 1,
+    keys_u64, u64, levels 3, group 2, rounds [a],
     _mm512_unpacklo_epi64, _mm512_unpackhi_epi64, _mm512_permutex2var_epi64, _mm512_max_epu64, _mm512_min_epu64,
     _mm512_set1_epi64, _mm512_add_epi64, _mm512_sub_epi64, _mm512_cmple_epu64_mask, _mm512_mask_cmpgt_epu64_mask,
     _mm512_mask_add_epi64, _mm512_mask_blend_epi64, u8, i64,
