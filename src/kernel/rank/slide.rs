@@ -103,17 +103,12 @@ fn exchange(column: &mut [u16; BINS], keys: &[i8], pairs: impl Iterator<Item = [
 }
 
 /// Histogram of the window about one voxel of a row.
+#[derive(Default)]
 pub(super) struct Window {
     coarse: [u32; 16],
     fine: [[u32; 16]; 16],
     /// Voxel, plus 1, for which each row of `fine` is right; 0 for none.
     upto: [usize; 16],
-}
-
-impl Default for Window {
-    fn default() -> Self {
-        Window { coarse: [0; 16], fine: [[0; 16]; 16], upto: [0; 16] }
-    }
 }
 
 multiversion! {
