@@ -218,6 +218,7 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
 }
 
 /// Extremes over z of a batch of output planes, straight from `src`. NaN never wins a comparison, so it does not count.
+#[allow(clippy::too_many_arguments)]
 fn planes_extremes<T: Float>(
     level: Level,
     job: &Job,

@@ -459,6 +459,7 @@ fn planes_extremes<T: Code, const M: bool>(
 }
 
 /// Extremes over y of a block of output rows from `j` on.
+#[allow(clippy::too_many_arguments)]
 pub fn rows_extremes<T: Elem>(
     level: Level,
     job: &Job,
@@ -523,5 +524,5 @@ pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
 
 /// Elements of work that both axes of [`blocked`] need.
 pub fn deep_len(job: &Job) -> usize {
-    lines::deep_len(job.window[0].max(job.window[1]), job.batch.max(job.rows) / 8)
+    lines::deep_len(job.window[0].max(job.window[1]), job.batch.max(job.rows) / 8, job.pitch)
 }

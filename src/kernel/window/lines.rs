@@ -222,16 +222,15 @@ fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
         left[k] = join_line::<T, M, TWO>(left[k + 1], src, lines.start(k) + x, coding);
     }
     let mut right = nothing;
-    for k in 0..B {
+    for (k, l) in left.iter().enumerate() {
         if k > 0 {
             right = join_line::<T, M, TWO>(right, src, lines.start(w + k - 1) + x, coding);
         }
         let start = out.0 + k * out.1 + x;
         let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
-        let (l, r) = (left[k], right);
         for i in 0..chunk {
-            to_lo[i] = l.0.as_ref()[i].lo(r.0.as_ref()[i]);
-            to_hi[i] = l.1.as_ref()[i].hi(r.1.as_ref()[i]);
+            to_lo[i] = l.0.as_ref()[i].lo(right.0.as_ref()[i]);
+            to_hi[i] = l.1.as_ref()[i].hi(right.1.as_ref()[i]);
         }
     }
 }
@@ -240,14 +239,14 @@ fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
 pub const DEEP: usize = 33;
 
 /// Elements of `work` that [`deep_extremes`] needs.
-pub fn deep_len(w: usize, blocks: usize) -> usize {
-    128 * (w / 8 + blocks + 1)
+pub fn deep_len(w: usize, blocks: usize, cols: usize) -> usize {
+    2 * cols * (w / 8 + blocks + 1)
 }
 
 crate::multiversion! {
     /// [`extremes`] for long windows (`w >= DEEP`) and `8 * blocks` outputs: the extremes of each group of 8 lines are
-    /// made once per column and kept in L1, so a block reads its groups, and lines only at the window's ends. `cols` is
-    /// at least a chunk.
+    /// made once, so a block reads its groups, and lines only at the window's ends. Whole lines are walked, since a
+    /// column of far planes would defeat the prefetcher. `cols` is at least a chunk.
     pub fn deep_extremes[T: Elem, const M: bool, const TWO: bool](
         masked: Masked<M>, sources: Sources<TWO>, src: [&[T]; 2], lines: Lines, w: usize, cols: usize,
         coding: Coding<T>, blocks: usize, lo: &mut [T], hi: &mut [T], out: (usize, usize), work: &mut [T]
@@ -276,20 +275,24 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
     nothing.1.as_mut().fill(T::LEAST);
     // Whole groups that all windows of a block hold: lines 8..8 + 8 groups of the block.
     let groups = (w - 8) / 8;
-    let mut x = 0;
-    loop {
-        for g in 1..blocks + groups {
+    let steps = cols.div_ceil(chunk);
+    for g in 1..blocks + groups {
+        for s in 0..steps {
+            let x = (s * chunk).min(cols - chunk);
             let mut m = nothing;
             for i in 8 * g..8 * g + 8 {
                 m = join_line::<T, M, TWO>(m, src, lines.start(i) + x, coding);
             }
-            work[2 * g * chunk..][..chunk].copy_from_slice(m.0.as_ref());
-            work[(2 * g + 1) * chunk..][..chunk].copy_from_slice(m.1.as_ref());
+            work[2 * g * cols + x..][..chunk].copy_from_slice(m.0.as_ref());
+            work[(2 * g + 1) * cols + x..][..chunk].copy_from_slice(m.1.as_ref());
         }
-        for q in 0..blocks {
+    }
+    for q in 0..blocks {
+        for s in 0..steps {
+            let x = (s * chunk).min(cols - chunk);
             let mut core = nothing;
             for g in q + 1..q + 1 + groups {
-                let (a, b) = (&work[2 * g * chunk..][..chunk], &work[(2 * g + 1) * chunk..][..chunk]);
+                let (a, b) = (&work[2 * g * cols + x..][..chunk], &work[(2 * g + 1) * cols + x..][..chunk]);
                 for i in 0..chunk {
                     core.0.as_mut()[i] = core.0.as_ref()[i].lo(a[i]);
                     core.1.as_mut()[i] = core.1.as_ref()[i].hi(b[i]);
@@ -315,10 +318,6 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
                 }
             }
         }
-        if x + chunk >= cols {
-            break;
-        }
-        x = (x + chunk).min(cols - chunk);
     }
 }
 
@@ -363,6 +362,7 @@ fn join_at_inner<E: Copy, O: Op<E>>(_: O, src: &[E], offsets: &[usize], out: &mu
 }
 
 #[inline(always)]
+#[allow(clippy::needless_range_loop)] // one index for many slices is what vectorises
 fn join_k<E: Copy, O: Op<E>, const K: usize>(src: &[E], offsets: &[usize], out: &mut [E], onto: bool) {
     let n = out.len();
     let t: [&[E]; K] = std::array::from_fn(|k| &src[offsets[k]..offsets[k] + n]);
@@ -505,7 +505,7 @@ mod tests {
                 for x in 0..cols {
                     let window = || {
                         let line = |i: usize| 1 + (i as isize - 4).clamp(2, 36) as usize * pitch + x;
-                        (k..k + w).map(move |i| line(i)).map(|i| src[i] ^ 0x80).filter(|v| !M || *v != 9)
+                        (k..k + w).map(line).map(|i| src[i] ^ 0x80).filter(|v| !M || *v != 9)
                     };
                     assert_eq!(lo[k * pitch + x], window().min().unwrap_or(255), "{level:?} {B} {w} {cols} {k} {x}");
                     assert_eq!(hi[k * pitch + x], window().max().unwrap_or(0));
@@ -525,7 +525,7 @@ mod tests {
         for level in Level::available() {
             for w in [33, 35, 40, 64, 129, 301] {
                 let [mut lo, mut hi, mut a, mut b] = [(); 4].map(|()| vec![0u16; 32 * pitch]);
-                let mut work = vec![0u16; deep_len(w, 4)];
+                let mut work = vec![0u16; deep_len(w, 4, 90)];
                 deep_extremes(level, m, s, [&src; 2], lines, w, 90, coding, 4, &mut lo, &mut hi, (0, pitch), &mut work);
                 for k in 0..4 {
                     let out = (8 * k * pitch, pitch);
