@@ -81,7 +81,9 @@ fn round(t: [__m512i; 16]) -> [__m512i; 16] {
 /// 64 rows of `stride` bytes, `stride` at least `count` rounded up to 64; the CPU has AVX-512.
 #[target_feature(enable = "avx512f,avx512bw")]
 unsafe fn turn_back(answers: *const u8, stride: usize, count: usize, hits: &mut [u8]) {
+    assert!(hits.len() >= count * LANES);
     for block in (0..count).step_by(64) {
+        let whole = block + 64 <= count;
         for group in 0..4 {
             // SAFETY: inside the 64 rows of `stride` bytes.
             let rows = std::array::from_fn(|i| unsafe {
@@ -96,10 +98,9 @@ unsafe fn turn_back(answers: *const u8, stride: usize, count: usize, hits: &mut 
                 ];
                 for (l, quarter) in quarters.into_iter().enumerate() {
                     let query = block + l * 16 + j;
-                    if query < count {
-                        let to = &mut hits[query * LANES + group * 16..][..16];
-                        // SAFETY: `to` has 16 bytes.
-                        unsafe { _mm_storeu_si128(to.as_mut_ptr().cast(), quarter) };
+                    if whole || query < count {
+                        // SAFETY: 16 bytes of the row of a query below `count`; `hits` has `count` rows.
+                        unsafe { _mm_storeu_si128(hits.as_mut_ptr().add(query * LANES + group * 16).cast(), quarter) };
                     }
                 }
             }
