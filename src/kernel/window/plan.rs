@@ -54,8 +54,9 @@ pub struct Job {
     pub batch: usize,
     /// Output planes whose extremes are made together.
     pub block: usize,
-    /// Output rows whose extremes are made together.
+    /// Output rows that go through y together, a multiple of `row_block`, the rows whose extremes are made together.
     pub rows: usize,
+    pub row_block: usize,
     /// Elements from row to row of tile buffers.
     pub pitch: usize,
     /// Rows of tile buffers.
@@ -83,20 +84,9 @@ impl Job {
             (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
         let tile = [even(dst[1], rows), width];
         let height = tile[0] + 2 * radius[1];
-        Job {
-            src,
-            dst,
-            at,
-            radius,
-            window,
-            needs,
-            tile,
-            batch,
-            block: planes,
-            rows: block(window[1], tile[0]),
-            pitch,
-            height,
-        }
+        let row_block = block(window[1], tile[0]);
+        let rows = row_block * if window[1] <= 32 { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
+        Job { src, dst, at, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
     }
 
     /// Most voxels in a window, and in its z-y section.
