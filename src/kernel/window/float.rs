@@ -28,6 +28,8 @@ impl Float for f64 {
 }
 
 /// Columns that go through z together: wide enough for the prefetcher, narrow enough for the tree to stay in L2.
+/// 2-core Zen 4 VM, AVX-512, 2026-11-23: mean of f32, r=10, 7.6 ns/voxel with 256 columns and column counts
+/// made once per tile, 10.9 with 64 and counts per row (the two were not measured apart; 64 for the rest is by size).
 fn columns(job: &Job) -> usize {
     if job.needs.variance || job.window[0] > 32 { 64 } else { 256 }
 }

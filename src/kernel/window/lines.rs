@@ -236,6 +236,7 @@ fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
 }
 
 /// Windows from which [`deep_extremes`] pays: below, a core of at most 25 lines is joined directly.
+/// 2-core Zen 4 VM, AVX-512, 2026-11-23: cdf_power of u16, r=64, 11.9 ns/voxel against 23.1 with [`extremes`] alone.
 pub const DEEP: usize = 33;
 
 /// Elements of `work` that [`deep_extremes`] needs.
