@@ -29,6 +29,9 @@ use crate::store::sink::Sink;
 use crate::store::{Source, VolumeInfo, open_inputs};
 use crate::{Error, Result};
 
+/// Turns a finished brick into chunks.
+type Deliver<'d> = dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync + 'd;
+
 /// One run, opened.
 pub struct Session<'a> {
     config: &'a Config,
@@ -294,7 +297,7 @@ impl<'a> Session<'a> {
         brick: &BrickChoice,
         work: &[Work],
         metrics: &Metrics,
-        deliver: &(dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync),
+        deliver: &Deliver,
         write: &(dyn Fn(Work, Vec<Item>) -> Result<()> + Sync),
         tick: &(dyn Fn() + Sync),
     ) -> Result<()> {
