@@ -447,6 +447,29 @@ impl Lowering<'_> {
         Ok(Some(Mask { wire, rule: rule.clone(), reach }))
     }
 
+    /// Stages that look at one field take one component; pointwise ones take as many on each side, or one.
+    fn check_components(&self, node: &StageNode, inputs: &[WireId]) -> Result<()> {
+        let count = |w: &WireId| self.out.graph.wires[*w].components;
+        let most = inputs.iter().map(count).max().unwrap_or(1);
+        let single = matches!(
+            node.op,
+            Op::Gradient { .. } | Op::Saliency { .. } | Op::Transfer { .. } | Op::OcclusionMap { .. }
+        );
+        let first = if matches!(node.op, Op::Obscurance(_)) { count(&inputs[0]) } else { 1 };
+        if (single && most > 1) || first > 1 {
+            let name = &self.out.graph.wires[inputs[0]].name;
+            let message = format!("\"{name}\" has {most} components; {} takes one (`channel = 0`)", node.op.word());
+            return Err(Error::config(format!("{}.input", node.place.key), message));
+        }
+        let mixed = !matches!(node.op, Op::Obscurance(_)) && inputs.iter().any(|w| count(w) != most && count(w) != 1);
+        if mixed {
+            let counts: Vec<usize> = inputs.iter().map(count).collect();
+            let message = format!("inputs of {counts:?} components; each must have as many as the others, or one");
+            return Err(Error::config(node.place.key.clone(), message));
+        }
+        Ok(())
+    }
+
     fn new_step(
         &mut self,
         node: &StageNode,
@@ -456,6 +479,7 @@ impl Lowering<'_> {
         border: Border,
     ) -> Result<StepId> {
         let mask = self.mask(node)?;
+        self.check_components(node, &inputs)?;
         let shapes = inputs.iter().chain(mask.as_ref().map(|m| &m.wire));
         let first = self.lattice(inputs[0]).shape;
         for &w in shapes {
