@@ -18,7 +18,8 @@ const NEVER: [(&str, &[&str]); 7] = [
 const HOMES: [(&str, &[&str]); 5] = [
     ("zarrs", &["store"]),
     ("memmap2", &["store"]),
-    ("rayon", &["run"]),
+    // Commands decode a row of chunks in parallel when they look at a volume without a run.
+    ("rayon", &["run", "cli"]),
     ("crossbeam_channel", &["run"]),
     ("wgpu", &["gpu"]),
 ];
@@ -52,7 +53,8 @@ fn folders_name_only_what_lies_below() {
             if path.file_name().is_some_and(|n| n.to_string_lossy().contains("test")) {
                 continue;
             }
-            for line in code(&path) {
+            // Instruction levels are chosen in one place; copies that swap bytes choose theirs there too.
+            for line in code(&path).into_iter().filter(|l| !l.contains("crate::kernel::simd::")) {
                 for other in never.iter().filter(|o| line.contains(&format!("crate::{o}::"))) {
                     faults.push(format!("{}: {folder} names {other}: {}", path.display(), line.trim()));
                 }
