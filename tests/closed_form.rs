@@ -61,9 +61,10 @@ fn a_uniform_field_gives_itself_by_the_power_law() {
 
 #[test]
 fn a_wall_dims_by_the_closed_form_of_each_rho() {
-    // One dense plane at z = 12 + h; directions that meet it within dmax contribute rho.
-    let (h, dmax) = (4usize, 10.0f64);
-    let v = Array3::from_shape_fn((40, 40, 40), |(z, _, _)| if z == 20 + h { 1.0 } else { 0.0 });
+    // One dense plane h voxels above; directions that meet it within dmax contribute rho. Lattice lines round by half a
+    // voxel, so the distances are long.
+    let (h, dmax) = (16usize, 40.0f64);
+    let v = Array3::from_shape_fn((40, 86, 86), |(z, _, _)| if z == 20 + h { 1.0 } else { 0.0 });
     let a = h as f64 / dmax;
     for (rho, expected) in [
         ("step", 1.0 - (1.0 - a) / 2.0),
@@ -72,7 +73,7 @@ fn a_wall_dims_by_the_closed_form_of_each_rho() {
     ] {
         let body =
             format!("op = 'obscurance'\nset = 'fibonacci'\ndirections = 400\nrho = '{rho}'\nmax_distance = {dmax}");
-        let o = stage(&v, &body)[[20, 20, 20]];
+        let o = stage(&v, &body)[[20, 43, 43]];
         assert!((o - expected).abs() < 0.012, "{rho}: {o}, closed form {expected}");
     }
 }
