@@ -81,6 +81,11 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     (kernel + copy + mask) as u64
 }
 
+/// f32 copies of three components that a sweep reads or writes.
+fn narrowed(shape: Shape, used: bool) -> usize {
+    if used { shape.iter().product::<usize>() * 12 } else { 0 }
+}
+
 /// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.
 fn window_dtype(dtype: DType, border: Border) -> DType {
     match border {

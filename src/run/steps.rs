@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use super::value::{Comp, Value};
 use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
-use crate::grid::{Affine, AnyView, AnyViewMut, Border, Region, Shape, View, ViewMut, Voxel};
+use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut, Voxel};
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::simd::Level;
 use crate::kernel::window::WindowOut;
@@ -170,13 +170,7 @@ impl<'a> Engine<'a> {
     ) -> Vec<Value> {
         let step = &self.plan.graph.steps[id];
         let wires: Vec<&Wire> = step.outputs.iter().map(|&w| &self.plan.graph.wires[w]).collect();
-        let mut outputs: Vec<Value> = wires
-            .iter()
-            .map(|w| {
-                let buffer = || Comp::Voxels(self.pool.take(w.dtype, region.voxels()));
-                Value { dtype: w.dtype, region, comps: (0..w.components).map(|_| buffer()).collect() }
-            })
-            .collect();
+        let mut outputs: Vec<Value> = wires.iter().map(|w| self.buffers(w.dtype, region, w.components)).collect();
         let mut cx = Context { level: self.level, scratch };
         let input_wire = &self.plan.graph.wires[step.inputs[0]];
         match &step.kind {
@@ -274,8 +268,15 @@ impl<'a> Engine<'a> {
             std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
         });
         let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
+        // Sweeps sum in fixed point and round to f32; results of f64 data are widened.
+        let wide = outputs[0].dtype == DType::F64;
+        let mut narrow_outputs: Vec<Value> = Vec::new();
+        if wide {
+            narrow_outputs = outputs.iter().map(|v| self.buffers(DType::F32, region, v.comps.len())).collect();
+        }
+        let targets = if wide { &mut narrow_outputs[..] } else { &mut *outputs };
         let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
-        for (channel, value) in channels.iter().zip(outputs) {
+        for (channel, value) in channels.iter().zip(targets) {
             let mut views = views_mut(value);
             match channel {
                 ObscuranceChannel::Openness => io.openness = views.pop(),
@@ -283,6 +284,18 @@ impl<'a> Engine<'a> {
             }
         }
         sweep.sweep(inputs[0].view(0, src_box), src_box, region, io, cx);
+        for (from, to) in narrow_outputs.into_iter().zip(outputs) {
+            for c in 0..from.comps.len() {
+                pointwise::scale(from.view(c, region), Affine::IDENTITY, None, view_mut(to, c));
+            }
+            from.recycle(self.pool);
+        }
+    }
+
+    /// Uninitialised voxels for a value.
+    fn buffers(&self, dtype: DType, region: Region, comps: usize) -> Value {
+        let buffer = || Comp::Voxels(self.pool.take(dtype, region.voxels()));
+        Value { dtype, region, comps: (0..comps).map(|_| buffer()).collect() }
     }
 
     fn pointwise(&self, step: &Step, inputs: &[&Value], outputs: &mut [Value], region: Region) {
