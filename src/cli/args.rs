@@ -32,10 +32,10 @@ pub enum Command {
     Preview(PreviewArgs),
     /// Measure time against error over the methods and settings of the config's [pareto] table
     ///
-    /// Keys of [pareto]: stage = the stage that is varied; reference = its keys for the reference, e.g.
-    /// { method = "exact" }; vary = { method = ["cdf_power", "chebyshev"], radius = [5, 10] }, whose combinations are run;
+    /// Keys of [pareto]: stage = the stage that is varied; reference = the keys in which a combination's
+    /// reference differs from it, e.g. { method = "exact" }; vary = { method = ["cdf_power", "chebyshev"], radius = [5, 10] }, whose combinations are run;
     /// folder = where outputs, pareto.csv, pareto.json and pareto.svg go (default "pareto"); repeat = runs per
-    /// combination, of which the fastest counts (default 1); keep = whether volumes are kept (default false).
+    /// combination, whose median counts, after one more to warm up where it is above 1 (default 1); keep = whether volumes are kept (default false).
     Pareto(ParetoArgs),
     /// Print the JSON Schema of the config
     Schema,
@@ -230,6 +230,9 @@ fn range(text: &str) -> Result<[f64; 2], String> {
 pub struct ParetoArgs {
     #[command(flatten)]
     pub config: ConfigArgs,
+    /// Name the cheapest combination whose rmse (over all voxels) is at most this, and the config lines for it
+    #[arg(long, value_name = "RMSE")]
+    pub max_error: Option<f64>,
     /// Print the table as JSON
     #[arg(long)]
     pub json: bool,

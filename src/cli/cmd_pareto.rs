@@ -1,5 +1,6 @@
 //! `occlude pareto`: run time against error over methods and settings.
 
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
@@ -7,6 +8,7 @@ use toml::{Table, Value};
 
 use super::args::{ParetoArgs, RawArgs};
 use super::cmd_compare::{self, Difference};
+use super::pareto_bands::{self as bands, Parts};
 use super::plot::{self, Point};
 use super::reader::Volume;
 use super::{human, load, messages, write_whole};
@@ -33,9 +35,29 @@ struct Job {
 /// One combination and what came of it.
 struct Row {
     settings: Table,
-    seconds: f64,
+    cost: Cost,
     difference: Difference,
+    parts: Parts,
     front: bool,
+}
+
+/// What a run costs.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cost {
+    /// Wall time, the median of the repeats.
+    seconds: f64,
+    /// Largest of the repeats.
+    peak_memory_bytes: u64,
+    bytes_read: u64,
+    bytes_written: u64,
+}
+
+/// A reference that was run: what combinations are compared with, and where their windows vary.
+struct Truth {
+    settings: Table,
+    path: PathBuf,
+    spread: Option<PathBuf>,
+    seconds: f64,
 }
 
 /// Runs every combination, then prints and writes the table.
@@ -51,8 +73,6 @@ pub fn run(args: &ParetoArgs, quiet: bool) -> Result<()> {
         }
     };
     let settings = combinations(&job);
-    let reference_path = job.folder.join("reference.zarr");
-    let reference = variant(args, &job, &job.reference, &reference_path)?;
     // Combinations that the config refuses are found before hours of runs, and left out.
     let mut accepted = Vec::new();
     for (i, settings) in settings.into_iter().enumerate() {
@@ -65,41 +85,143 @@ pub fn run(args: &ParetoArgs, quiet: bool) -> Result<()> {
     if accepted.is_empty() {
         return Err(Error::config("pareto.vary", "no combination is accepted").located(&base.file, None));
     }
-    say(&format!("reference: {}", label(&job.reference)));
-    let reference_seconds = timed(&reference, 1, &cancel)?;
+    let gradient = gradient(&job, &accepted[0].1, &cancel)?;
+    let mut truths: Vec<Truth> = Vec::new();
     let mut rows = Vec::new();
     let total = accepted.len();
     for (i, (settings, config, path)) in accepted.into_iter().enumerate() {
-        let seconds = timed(&config, job.repeat, &cancel)?;
-        let raw = RawArgs::default();
-        let a = Volume::open(&reference_path, 0, &raw, &cancel)?;
-        let b = Volume::open(&path, 0, &raw, &cancel)?;
-        let difference = cmd_compare::compare(&a, &b, &cancel)?;
+        let wanted = reference_of(&job, &settings);
+        let truth = match truths.iter().position(|t| t.settings == wanted) {
+            Some(at) => &truths[at],
+            None => {
+                say(&format!("reference: {}", label(&wanted)));
+                truths.push(Truth::run(args, &job, wanted, truths.len(), &cancel)?);
+                &truths[truths.len() - 1]
+            }
+        };
+        let cost = timed(&config, job.repeat, &cancel)?;
+        let (difference, parts) = judge(truth, &path, gradient.as_ref(), &cancel)?;
         say(&format!(
             "{}/{total} {}: {}, rmse {}",
             i + 1,
             label(&settings),
-            human::seconds(seconds),
+            human::seconds(cost.seconds),
             human::number(difference.rmse)
         ));
-        rows.push(Row { settings, seconds, difference, front: false });
+        rows.push(Row { settings, cost, difference, parts, front: false });
         if !job.keep {
             remove(&path);
         }
     }
     if !job.keep {
-        remove(&reference_path);
+        truths.iter().for_each(Truth::remove);
+    }
+    if let Some((path, _)) = &gradient {
+        remove(path);
     }
     mark_front(&mut rows);
+    let references: Vec<_> = truths.iter().map(|t| json!({"settings": t.settings, "seconds": t.seconds})).collect();
     let json = json!({
         "stage": job.stage,
-        "reference": {"settings": job.reference, "seconds": reference_seconds},
+        "references": references,
         "runs": rows.iter().map(Row::json).collect::<Vec<_>>(),
+        "cheapest": args.max_error.map(|bound| cheapest(&rows, bound).map(Row::json)),
     });
     write_whole(&job.folder.join("pareto.json"), format!("{json:#}\n").as_bytes())?;
     write_whole(&job.folder.join("pareto.csv"), csv(&job, &rows).as_bytes())?;
     write_whole(&job.folder.join("pareto.svg"), picture(&job, &rows).as_bytes())?;
-    if args.json { messages::result_json(&json) } else { messages::result(&text(&rows, reference_seconds)) }
+    if args.json {
+        return messages::result_json(&json);
+    }
+    let colours = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none();
+    let mut shown = text(&rows, colours);
+    if let Some(bound) = args.max_error {
+        shown += &advice(&job, &rows, bound);
+    }
+    messages::result(&shown)
+}
+
+/// A combination's reference: the combination, with the keys that `reference` gives.
+fn reference_of(job: &Job, settings: &Table) -> Table {
+    let mut all = settings.clone();
+    all.extend(job.reference.clone());
+    all
+}
+
+impl Truth {
+    fn run(args: &ParetoArgs, job: &Job, settings: Table, index: usize, cancel: &Cancel) -> Result<Truth> {
+        let path = job.folder.join(format!("reference{index}.zarr"));
+        let config = variant(args, job, &settings, &path)?;
+        let seconds = timed(&config, 1, cancel)?.seconds;
+        let spread = job.folder.join(format!("spread{index}.zarr"));
+        let helper = bands::spread_of(&config, &job.stage, &spread);
+        if let Some(helper) = &helper {
+            timed(helper, 1, cancel)?;
+        }
+        Ok(Truth { settings, path, spread: helper.map(|_| spread), seconds })
+    }
+
+    fn remove(&self) {
+        std::iter::once(&self.path).chain(&self.spread).for_each(|p| remove(p));
+    }
+}
+
+/// The gradient's magnitude of the stage's input and the least of the surface band; `None` where there is no gradient.
+fn gradient(job: &Job, variant: &Config, cancel: &Cancel) -> Result<Option<(PathBuf, f64)>> {
+    let path = job.folder.join("gradient.zarr");
+    let Some(config) = bands::gradient_of(variant, &job.stage, &path) else { return Ok(None) };
+    match timed(&config, 1, cancel) {
+        Ok(_) => {
+            let volume = Volume::open(&path, 0, &RawArgs::default(), cancel)?;
+            Ok(Some((path, bands::band_from(&volume, cancel)?)))
+        }
+        // Inputs of several components have none.
+        Err(Error::Config { .. }) => Ok(None),
+        Err(e) => Err(e),
+    }
+}
+
+fn judge(
+    truth: &Truth,
+    path: &Path,
+    gradient: Option<&(PathBuf, f64)>,
+    cancel: &Cancel,
+) -> Result<(Difference, Parts)> {
+    let open = |path: &Path| Volume::open(path, 0, &RawArgs::default(), cancel);
+    let (a, b) = (open(&truth.path)?, open(path)?);
+    // Bias is that of the combination: its value less the reference's.
+    let difference = cmd_compare::compare(&b, &a, cancel)?;
+    let mut parts = Parts::default();
+    if let Some(spread) = &truth.spread {
+        parts.windows = Some(bands::errors(&a, &b, &open(spread)?, 0.0, cancel)?);
+    }
+    if let Some((gradient, least)) = gradient {
+        let mask = open(gradient)?;
+        // An occlusion map may live on a coarser lattice than its input.
+        if mask.info().shape == a.info().shape {
+            parts.surface = Some(bands::errors(&a, &b, &mask, *least, cancel)?);
+        }
+    }
+    Ok((difference, parts))
+}
+
+/// The fastest row within a bound.
+fn cheapest(rows: &[Row], bound: f64) -> Option<&Row> {
+    let within = rows.iter().filter(|r| r.difference.rmse <= bound);
+    within.min_by(|a, b| a.cost.seconds.total_cmp(&b.cost.seconds))
+}
+
+/// The cheapest combination within a bound and its lines of the config.
+fn advice(job: &Job, rows: &[Row], bound: f64) -> String {
+    let Some(row) = cheapest(rows, bound) else {
+        return format!("\n\nno combination is within rmse {}", human::number(bound));
+    };
+    let mut lines = vec![
+        format!("\n\ncheapest within rmse {}: {}", human::number(bound), label(&row.settings)),
+        format!("[stage.{}]", toml_edit::Key::new(&job.stage)),
+    ];
+    lines.extend(row.settings.iter().map(|(k, v)| format!("{} = {v}", toml_edit::Key::new(k))));
+    lines.join("\n")
 }
 
 fn wrong(key: &str, message: impl std::fmt::Display) -> Error {
@@ -196,15 +318,25 @@ fn variant(args: &ParetoArgs, job: &Job, settings: &Table, path: &Path) -> Resul
     Ok(config)
 }
 
-/// Seconds of the fastest of so many runs.
-fn timed(config: &Config, repeat: u32, cancel: &Cancel) -> Result<f64> {
+/// Cost of a run: the median of so many, after one to warm up where there are several.
+fn timed(config: &Config, repeat: u32, cancel: &Cancel) -> Result<Cost> {
     let options = RunOptions { overwrite: true, cancel: cancel.clone(), ..RunOptions::default() };
-    let mut best = f64::INFINITY;
-    for _ in 0..repeat {
-        let report = run::run(config, &options, &Silent).map_err(|e| e.located(&config.file, None))?;
-        best = best.min(report.seconds);
+    let run = || run::run(config, &options, &Silent).map_err(|e| e.located(&config.file, None));
+    if repeat > 1 {
+        run()?;
     }
-    Ok(best)
+    let mut cost = Cost::default();
+    let mut seconds = Vec::new();
+    for _ in 0..repeat {
+        let report = run()?;
+        seconds.push(report.seconds);
+        cost.peak_memory_bytes = cost.peak_memory_bytes.max(report.peak_memory_bytes);
+        (cost.bytes_read, cost.bytes_written) = (report.bytes_read, report.bytes_written);
+    }
+    seconds.sort_by(f64::total_cmp);
+    let n = seconds.len();
+    cost.seconds = (seconds[(n - 1) / 2] + seconds[n / 2]) / 2.0;
+    Ok(cost)
 }
 
 /// Takes away an output of ours and what lies beside it.
@@ -215,7 +347,7 @@ fn remove(path: &Path) {
 
 /// Marks rows that no other row beats in time and error both.
 fn mark_front(rows: &mut [Row]) {
-    let at: Vec<[f64; 2]> = rows.iter().map(|r| [r.seconds, r.difference.rmse]).collect();
+    let at: Vec<[f64; 2]> = rows.iter().map(|r| [r.cost.seconds, r.difference.rmse]).collect();
     for (row, own) in rows.iter_mut().zip(&at) {
         let beats = |o: &[f64; 2]| o[0] <= own[0] && o[1] <= own[1] && (o[0] < own[0] || o[1] < own[1]);
         row.front = !own[1].is_nan() && !at.iter().any(beats);
@@ -231,7 +363,12 @@ fn label(settings: &Table) -> String {
 
 impl Row {
     fn json(&self) -> serde_json::Value {
-        let mut json = json!({"settings": self.settings, "seconds": self.seconds, "front": self.front});
+        let mut json = json!({
+            "settings": self.settings, "seconds": self.cost.seconds, "front": self.front,
+            "peak_memory_bytes": self.cost.peak_memory_bytes, "bytes_read": self.cost.bytes_read,
+            "bytes_written": self.cost.bytes_written, "windows_that_vary": self.parts.windows.map(|p| p.json()),
+            "surface_band": self.parts.surface.map(|p| p.json()),
+        });
         if let (Some(all), Some(more)) = (json.as_object_mut(), self.difference.json().as_object()) {
             all.extend(more.clone());
         }
@@ -239,11 +376,29 @@ impl Row {
     }
 }
 
-const COLUMNS: [&str; 7] = ["seconds", "rmse", "mae", "bias", "max_abs", "p99", "ssim"];
+/// `rmse_vary`: windows that are not constant; `rmse_edge`: surface band.
+const COLUMNS: [&str; 12] = [
+    "seconds",
+    "rmse",
+    "mae",
+    "bias",
+    "max_abs",
+    "p99",
+    "ssim",
+    "rmse_vary",
+    "bias_vary",
+    "rmse_edge",
+    "bias_edge",
+    "peak_MiB",
+];
 
-fn numbers(r: &Row) -> [f64; 7] {
+fn numbers(r: &Row) -> [f64; 12] {
     let d = &r.difference;
-    [r.seconds, d.rmse, d.mae, d.bias, d.max_abs, d.p99, d.ssim.unwrap_or(f64::NAN)]
+    let part = |p: Option<bands::Part>| p.map_or([f64::NAN; 2], |p| [p.rmse, p.bias]);
+    let ([vary, vary_bias], [edge, edge_bias]) = (part(r.parts.windows), part(r.parts.surface));
+    let ssim = d.ssim.unwrap_or(f64::NAN);
+    let peak = r.cost.peak_memory_bytes as f64 / 1_048_576.0;
+    [r.cost.seconds, d.rmse, d.mae, d.bias, d.max_abs, d.p99, ssim, vary, vary_bias, edge, edge_bias, peak]
 }
 
 fn csv(job: &Job, rows: &[Row]) -> String {
@@ -262,18 +417,36 @@ fn csv(job: &Job, rows: &[Row]) -> String {
     text
 }
 
-fn text(rows: &[Row], reference_seconds: f64) -> String {
+fn text(rows: &[Row], colours: bool) -> String {
     let width = rows.iter().map(|r| label(&r.settings).chars().count()).max().unwrap_or(0).max(8);
-    let mut lines = vec![format!("{:width$}  {}", "settings", COLUMNS.map(|c| format!("{c:>11}")).join(" "))];
+    let mut lines = vec![format!("{:width$}  {}", "settings", COLUMNS.map(|c| format!("{c:>10}")).join(" "))];
     let mut sorted: Vec<&Row> = rows.iter().collect();
-    sorted.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+    sorted.sort_by(|a, b| a.cost.seconds.total_cmp(&b.cost.seconds));
     for row in sorted {
-        let cells = numbers(row).map(|v| format!("{:>11}", human::number(v))).join(" ");
+        let cells = numbers(row).map(|v| format!("{:>10}", brief(v))).join(" ");
         let mark = if row.front { " *" } else { "" };
-        lines.push(format!("{:width$}  {cells}{mark}", label(&row.settings)));
+        let line = format!("{:width$}  {cells}{mark}", label(&row.settings));
+        lines.push(if colours && !row.front { format!("\x1b[2m{line}\x1b[0m") } else { line });
     }
-    lines.push(format!("* on the front; reference: {}", human::seconds(reference_seconds)));
+    let n = rows.first().map_or(0, |r| r.difference.n);
+    let part = |f: fn(&Parts) -> Option<bands::Part>| {
+        rows.iter().find_map(|r| f(&r.parts)).map_or("none".to_string(), |p| p.n.to_string())
+    };
+    lines.push(format!(
+        "* on the front; voxels: {n}, in windows that vary {}, in the surface band {}",
+        part(|p| p.windows),
+        part(|p| p.surface)
+    ));
     lines.join("\n")
+}
+
+/// Four digits are enough to choose by.
+fn brief(v: f64) -> String {
+    match v {
+        v if v == 0.0 || !v.is_finite() => format!("{v}"),
+        v if (1e-3..1e5).contains(&v.abs()) => format!("{v:.4}"),
+        v => format!("{v:.2e}"),
+    }
 }
 
 fn picture(job: &Job, rows: &[Row]) -> String {
@@ -281,7 +454,7 @@ fn picture(job: &Job, rows: &[Row]) -> String {
     let point = |r: &Row| Point {
         label: label(&r.settings),
         series: method(r),
-        at: [r.seconds, r.difference.rmse],
+        at: [r.cost.seconds, r.difference.rmse],
         front: r.front,
     };
     let points: Vec<Point> = rows.iter().filter(|r| r.difference.rmse.is_finite()).map(point).collect();
@@ -332,12 +505,40 @@ mod tests {
     fn the_front_has_what_nothing_beats() {
         let row = |seconds, rmse| Row {
             settings: Table::new(),
-            seconds,
+            cost: Cost { seconds, ..Cost::default() },
+            parts: Parts::default(),
             difference: Difference { rmse, mae: 0.0, bias: 0.0, max_abs: 0.0, p99: 0.0, ssim: None, n: 1 },
             front: false,
         };
         let mut rows = [row(1.0, 0.5), row(2.0, 0.1), row(2.0, 0.2), row(3.0, 0.1), row(0.5, f64::NAN)];
         mark_front(&mut rows);
         assert_eq!(rows.each_ref().map(|r| r.front), [true, true, false, false, false]);
+    }
+
+    #[test]
+    fn the_cheapest_within_a_bound_is_named_with_its_lines() {
+        let job = config(
+            "[pareto]\nstage=\"ao\"\nreference={ method=\"exact\" }\nvary={ method=[\"chebyshev\", \"cdf_power\"] }",
+        )
+        .unwrap();
+        let row = |settings, seconds, rmse| Row {
+            settings,
+            cost: Cost { seconds, ..Cost::default() },
+            difference: Difference { rmse, mae: 0.0, bias: 0.0, max_abs: 0.0, p99: 0.0, ssim: None, n: 1 },
+            parts: Parts::default(),
+            front: false,
+        };
+        let settings = combinations(&job);
+        let rows = [row(settings[0].clone(), 1.0, 0.4), row(settings[1].clone(), 2.0, 0.1)];
+        assert!(
+            advice(&job, &rows, 0.2).ends_with("[stage.ao]\nmethod = \"cdf_power\""),
+            "{}",
+            advice(&job, &rows, 0.2)
+        );
+        assert!(advice(&job, &rows, 0.5).contains("method=chebyshev"));
+        assert!(advice(&job, &rows, 0.01).contains("no combination"));
+        assert_eq!(label(&reference_of(&job, &settings[0])), "method=exact");
+        // A quantity that is not a number is within no bound.
+        assert!(cheapest(&[row(Table::new(), 1.0, f64::NAN)], 1.0).is_none());
     }
 }

@@ -12,6 +12,7 @@ pub mod draw;
 pub mod human;
 pub mod messages;
 pub mod moments;
+pub mod pareto_bands;
 pub mod plot;
 pub mod progress;
 pub mod reader;

@@ -100,6 +100,7 @@ fn ambient_occlusion(r: &Reader, input: Ref) -> Result<Op> {
         ("gaussian_cdf", Method::GaussianCdf),
         ("chebyshev", Method::Chebyshev),
         ("chebyshev_literal", Method::ChebyshevLiteral),
+        ("beta", Method::Beta),
     ];
     let regions = [("box", AoRegion::Box), ("equal_volume", AoRegion::EqualVolume), ("ball", AoRegion::Ball)];
     let method = r.choice("method", &methods)?;

@@ -15,6 +15,8 @@ pub enum Method {
     Chebyshev,
     /// Eq. 12 of E as printed.
     ChebyshevLiteral,
+    /// Beta distribution on the window's [min, max] with its mean and variance.
+    Beta,
 }
 
 /// How voxels equal to the centre count.

@@ -81,9 +81,16 @@ impl<'a, 'b> Emit<'a, 'b> {
                     let polarity = polarity(self.params, ties);
                     let (v, flip, n) = (row.v, setup.flip, row.n);
                     let numerator = &self.numerator[..len.min(self.numerator.len())];
-                    let fill = |out: &mut [f32]| match spread_of(method) {
-                        None => estimate::cdf_power_row(level, v, flip, row.lo, row.hi, row.s1, n, polarity, out),
-                        Some(kind) => estimate::spread_row(level, kind, v, flip, row.s1, n, numerator, polarity, out),
+                    let fill = |out: &mut [f32]| match estimator(method) {
+                        Estimator::Power => {
+                            estimate::cdf_power_row(level, v, flip, row.lo, row.hi, row.s1, n, polarity, out)
+                        }
+                        Estimator::Beta => {
+                            estimate::beta_row(level, v, flip, row.lo, row.hi, row.s1, n, numerator, polarity, out)
+                        }
+                        Estimator::Spread(kind) => {
+                            estimate::spread_row(level, kind, v, flip, row.s1, n, numerator, polarity, out)
+                        }
                     };
                     put_openness(level, &mut self.outs[i].dst, at, len, self.open, fill);
                 }
@@ -110,13 +117,20 @@ pub fn polarity(params: &WindowParams, ties: Ties) -> Polarity {
     Polarity { flipped: params.flipped(), constant }
 }
 
-/// `None` for `cdf_power`.
-pub fn spread_of(method: Method) -> Option<Spread> {
+/// What a method is computed by.
+pub enum Estimator {
+    Power,
+    Beta,
+    Spread(Spread),
+}
+
+pub fn estimator(method: Method) -> Estimator {
     match method {
-        Method::CdfPower => None,
-        Method::GaussianCdf => Some(Spread::Gaussian),
-        Method::Chebyshev => Some(Spread::Chebyshev),
-        Method::ChebyshevLiteral => Some(Spread::Literal),
+        Method::CdfPower => Estimator::Power,
+        Method::Beta => Estimator::Beta,
+        Method::GaussianCdf => Estimator::Spread(Spread::Gaussian),
+        Method::Chebyshev => Estimator::Spread(Spread::Chebyshev),
+        Method::ChebyshevLiteral => Estimator::Spread(Spread::Literal),
         Method::Exact => unreachable!("refused when the needs were worked out"),
     }
 }

@@ -1,7 +1,9 @@
 //! From exact integer sums of one row of windows to results. Codes are unsigned: a stored value is `code - offset`.
 
+use super::beta::{self, Terms};
 use super::lines::Elem;
 use super::math;
+use crate::kernel::simd::Level;
 
 /// Integer that sums are kept in; arithmetic wraps, and the caller proves that final values fit.
 pub trait Acc: Copy + Default + PartialOrd + std::fmt::Debug + 'static {
@@ -347,6 +349,35 @@ fn spread_inner<T: Code, X1: RowSum>(
         Spread::Chebyshev => row!(Spread::Chebyshev),
         Spread::Literal => row!(Spread::Literal),
     }
+}
+
+/// [`super::beta`] from codes of the centre, extremes, S1 and the numerator row.
+#[allow(clippy::too_many_arguments)]
+pub fn beta_row<T: Code, X1: RowSum>(
+    level: Level,
+    v: &[T],
+    flip: T,
+    lo: &[T],
+    hi: &[T],
+    s1: &[X1],
+    n: &[u32],
+    numerator: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) {
+    let terms = |i: usize| {
+        let (c, lo, hi) = (v[i].code(flip).u32(), lo[i].u32(), hi[i].u32());
+        let below = c as f64 - lo as f64;
+        let above = hi as f64 - c as f64;
+        let over = s1[i].minus(X1::times(n[i], lo)).low() as f64;
+        let under = X1::times(n[i], hi).minus(s1[i]).low() as f64;
+        let numerator = numerator[i];
+        match polarity.flipped {
+            false => Terms { below, above, over, under, numerator },
+            true => Terms { below: above, above: below, over: under, under: over, numerator },
+        }
+    };
+    beta::beta_row(level, terms, polarity.constant, out);
 }
 
 crate::multiversion! {

@@ -1,5 +1,6 @@
 //! From moments of one row of float windows to results.
 
+use super::beta::{self, Terms};
 use super::estimate::{Polarity, Spread};
 use super::math;
 use super::merge::{Pair, Sum};
@@ -199,6 +200,38 @@ fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, above: f32) -> f32 {
         above
     } else {
         1.0 - above
+    }
+}
+
+/// [`super::beta`] for a row. Everything is halved, since the range of f64 values may exceed the largest of them.
+#[allow(clippy::too_many_arguments)]
+pub fn beta_row<T: Voxel, A: Sum>(
+    level: Level,
+    v: &[T],
+    lo: &[T],
+    hi: &[T],
+    s: &[A],
+    m: &[f64],
+    n: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) {
+    let terms = |i: usize| {
+        let (v, lo, hi) = (v[i].to_f64(), lo[i].to_f64(), hi[i].to_f64());
+        let (below, above) = (0.5 * v - 0.5 * lo, 0.5 * hi - 0.5 * v);
+        let (over, under) = (s[i].less(n[i], lo), -s[i].less(n[i], hi));
+        let numerator = n[i] * m[i];
+        match polarity.flipped {
+            false => Terms { below, above, over, under, numerator },
+            true => Terms { below: above, above: below, over: under, under: over, numerator },
+        }
+    };
+    beta::beta_row(level, terms, polarity.constant, out);
+    for i in 0..out.len() {
+        let (v, lo, hi) = (v[i].to_f64(), lo[i].to_f64(), hi[i].to_f64());
+        if lo != hi && (lo.is_infinite() || hi.is_infinite()) {
+            out[i] = infinite(v, lo, hi, polarity.flipped, 0.0);
+        }
     }
 }
 

@@ -65,6 +65,44 @@ pub fn log2(x: f64) -> f64 {
     shift + ((bits as i64) >> 52) as f64 + log2_1p(mantissa as f32) as f64
 }
 
+/// Natural logarithm of a normal `x > 0`, f64, relative error 4e-16 away from 1, absolute 1e-16 near it.
+#[inline(always)]
+pub fn ln(x: f64) -> f64 {
+    const ROOT_HALF: u64 = 0x3fe6_a09e_667f_3bcd;
+    const LN2_HIGH: f64 = f64::from_bits(0x3fe6_2e42_fee0_0000); // 32 bits: its multiples are exact
+    const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
+    let bits = x.to_bits().wrapping_sub(ROOT_HALF);
+    let exponent = ((bits as i64) >> 52) as f64;
+    let f = f64::from_bits((bits & 0xf_ffff_ffff_ffff) + ROOT_HALF) - 1.0;
+    // 2 artanh(s), s in [-0.172, 0.172]: ten terms of the series leave 2e-17.
+    let s = f / (2.0 + f);
+    let w = s * s;
+    let mut p = 1.0 / 21.0;
+    for odd in [19.0, 17.0, 15.0, 13.0, 11.0, 9.0, 7.0, 5.0, 3.0] {
+        p = w.mul_add(p, 1.0 / odd);
+    }
+    let near = 2.0 * s * (w * p) + 2.0 * s;
+    exponent.mul_add(LN2_HIGH, exponent.mul_add(LN2_LOW, near))
+}
+
+/// `e^x` in f64 for `x` in [-700, 700] (clamped), relative error 2e-14.
+#[inline(always)]
+pub fn exp(x: f64) -> f64 {
+    const LN2_HIGH: f64 = f64::from_bits(0x3fe6_2e42_fee0_0000);
+    const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
+    const MAGIC: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52: adding it rounds to the nearest integer
+    let x = if x > -700.0 { x } else { -700.0 };
+    let x = if x < 700.0 { x } else { 700.0 };
+    let z = x.mul_add(std::f64::consts::LOG2_E, MAGIC);
+    let n = z - MAGIC;
+    let r = n.mul_add(-LN2_LOW, n.mul_add(-LN2_HIGH, x));
+    let mut p = 1.0 / 39_916_800.0; // 1 / 11!
+    for inverse in [3_628_800.0, 362_880.0, 40_320.0, 5_040.0, 720.0, 120.0, 24.0, 6.0, 2.0, 1.0, 1.0] {
+        p = r.mul_add(p, 1.0 / inverse);
+    }
+    f64::from_bits(p.to_bits().wrapping_add(z.to_bits() << 52))
+}
+
 /// Standard normal distribution function, absolute error 2e-7 (Abramowitz and Stegun 7.1.26).
 #[inline(always)]
 pub fn phi(z: f32) -> f32 {
@@ -113,6 +151,17 @@ mod tests {
             assert!((phi(z) as f64 - p).abs() < 3e-7, "{z}");
             assert!((phi(-z) as f64 - (1.0 - p)).abs() < 3e-7, "-{z}");
         }
+    }
+
+    #[test]
+    fn ln_and_exp_agree_with_the_library() {
+        for i in 0..20_000 {
+            let x = 10f64.powf(-300.0 + 0.03 * i as f64);
+            assert!((ln(x) - x.ln()).abs() <= 5e-16 * x.ln().abs().max(0.3), "ln {x}");
+            let y = -690.0 + 0.069 * i as f64;
+            assert!((exp(y) / y.exp() - 1.0).abs() < 3e-14, "exp {y}");
+        }
+        assert_eq!((ln(1.0), exp(0.0)), (0.0, 1.0));
     }
 
     #[test]

@@ -9,13 +9,15 @@ use super::Context;
 use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{WindowChannel, WindowParams};
 
+mod beta;
 mod emit;
 mod estimate;
 mod float;
 mod float_estimate;
 mod int;
 mod lines;
-mod math;
+#[doc(hidden)]
+pub mod math;
 mod merge;
 mod plan;
 #[doc(hidden)]

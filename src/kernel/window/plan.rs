@@ -27,6 +27,9 @@ impl Needs {
                 }
                 WindowChannel::Openness(Method::Exact, _) => panic!("exact openness has a kernel of its own"),
                 WindowChannel::Openness(Method::CdfPower, _) => (needs.extremes, needs.mean) = (true, true),
+                WindowChannel::Openness(Method::Beta, _) => {
+                    (needs.extremes, needs.mean, needs.variance) = (true, true, true)
+                }
                 WindowChannel::Openness(..) => {
                     (needs.mean, needs.variance) = (true, true);
                     needs.extremes |= float;

@@ -84,6 +84,13 @@ pub fn voxel<T: Voxel>(src: View<T>, c: [usize; 3], params: &WindowParams, chann
                 Method::Chebyshev => 1.0 - variance / (variance + mean * mean),
                 Method::ChebyshevLiteral if mean >= 0.0 => 1.0,
                 Method::ChebyshevLiteral => variance / (variance + mean * mean),
+                Method::Beta if below == 0.0 => 0.0,
+                Method::Beta if above == 0.0 => 1.0,
+                Method::Beta => {
+                    let share = (mean + below) / range;
+                    let k = (share * (above - mean) * range / variance - 1.0).clamp(1e-9, 1e8);
+                    beta(below / range, share * k, (above - mean) / range * k)
+                }
                 Method::Exact => panic!("exact openness has a kernel of its own"),
             }
         }
@@ -99,6 +106,36 @@ fn sum(values: impl Iterator<Item = f64>) -> f64 {
         s = t;
     }
     s + c
+}
+
+/// `I_x(a, b)` from its integral by Gauss's hypergeometric series, `x^a y^b / (a B(a, b)) sum of (a + b)_i / (a + 1)_i
+/// x^i`, all of whose terms are positive; from the side on which it converges faster.
+pub fn beta(x: f64, a: f64, b: f64) -> f64 {
+    if x * (a + b) > a {
+        return 1.0 - beta_series(1.0 - x, b, a);
+    }
+    beta_series(x, a, b)
+}
+
+fn beta_series(x: f64, a: f64, b: f64) -> f64 {
+    let (mut term, mut total, mut i) = (1.0, 1.0, 0.0);
+    while term > 1e-17 * total && i < 1e7 {
+        term *= (a + b + i) / (a + 1.0 + i) * x;
+        total += term;
+        i += 1.0;
+    }
+    let log = a * x.ln() + b * (-x).ln_1p() + ln_gamma(a + b) - ln_gamma(a + 1.0) - ln_gamma(b);
+    log.exp() * total
+}
+
+/// Logarithm of the gamma function: Stirling's series from 20 up.
+fn ln_gamma(z: f64) -> f64 {
+    if z < 20.0 {
+        return ln_gamma(z + 1.0) - z.ln();
+    }
+    let w = 1.0 / (z * z);
+    let series = (1.0 / 12.0 - w * (1.0 / 360.0 - w * (1.0 / 1260.0 - w / 1680.0))) / z;
+    (z - 0.5) * z.ln() - z + 0.5 * (2.0 * std::f64::consts::PI).ln() + series
 }
 
 /// Standard normal distribution function: Taylor series of the integral near 0, continued fraction (Lentz) beyond.

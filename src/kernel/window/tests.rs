@@ -6,7 +6,8 @@ use crate::grid::Affine;
 use crate::kernel::simd::Level;
 use crate::stage::{Method, Ties};
 
-const METHODS: [Method; 4] = [Method::CdfPower, Method::GaussianCdf, Method::Chebyshev, Method::ChebyshevLiteral];
+const METHODS: [Method; 5] =
+    [Method::CdfPower, Method::GaussianCdf, Method::Chebyshev, Method::ChebyshevLiteral, Method::Beta];
 
 fn params(radius: [usize; 3]) -> WindowParams {
     WindowParams { radius, affine: Affine::IDENTITY, missing: None, solid_low: false }
