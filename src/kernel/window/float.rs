@@ -4,7 +4,8 @@
 use super::emit::{Emit, polarity, put_moment, put_openness, repair, spread_of};
 use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, deep_len, rows_extremes};
-use super::lines::{self, Add, Coding, Elem, Hi, Lines, Lo, Masked, Op, Sources};
+use super::along::SLACK;
+use super::lines::{self, Add, Coding, Elem, Lines, Masked, Op, Sources};
 use super::merge::{Moments, Sum, Wanted, gather, grow, tree_merge};
 use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
 use super::{Context, WindowOut};
@@ -37,8 +38,8 @@ fn columns(job: &Job) -> usize {
 /// Bytes of scratch.
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let k = job.needs.extremes as usize;
-    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
-    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1]);
+    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
+    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
     Emit::bytes(job.tile[1]) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
 }
 
@@ -109,12 +110,12 @@ pub fn run<T: Float>(
     let k = needs.extremes as usize;
     let lo = cut::<T>(bytes, k * job.batch * job.plane());
     let hi = cut::<T>(bytes, k * job.batch * job.plane());
-    let row_lo = cut::<T>(bytes, k * job.rows * job.pitch);
-    let row_hi = cut::<T>(bytes, k * job.rows * job.pitch);
+    let row_lo = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
+    let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let work = cut::<T>(bytes, k * 2 * job.pitch);
     let deep = cut::<T>(bytes, k * deep_len(job));
-    let out_lo = cut::<T>(bytes, k * job.tile[1]);
-    let out_hi = cut::<T>(bytes, k * job.tile[1]);
+    let out_lo = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let out_hi = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
     let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
@@ -146,8 +147,8 @@ pub fn run<T: Float>(
                         }
                         let line = (j % job.rows) * job.pitch;
                         let w = job.window[2];
-                        lines::tree_extreme(level, Lo, &row_lo[line..line + job.pitch], w, 1, out_lo, work);
-                        lines::tree_extreme(level, Hi, &row_hi[line..line + job.pitch], w, 1, out_hi, work);
+                        let n = job.tile[1];
+                        lines::row_extremes(level, &row_lo[line..], &row_hi[line..], w, n, out_lo, out_hi, work);
                     }
                     if needs.mean {
                         let from = b.rows.part(j * job.pitch..(j + 1) * job.pitch);
