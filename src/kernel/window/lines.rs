@@ -427,12 +427,12 @@ fn join_k<E: Copy, O: Op<E>, const K: usize>(src: &[E], offsets: &[usize], out: 
     } else {
         for i in 0..n {
             // SAFETY: as above.
-            let mut s = unsafe { *t[0].get_unchecked(i) };
-            for a in &t[1..] {
-                // SAFETY: as above.
-                s = O::join(s, unsafe { *a.get_unchecked(i) });
-            }
-            out[i] = s;
+            let e: [E; K] = std::array::from_fn(|k| unsafe { *t[k].get_unchecked(i) });
+            out[i] = if K == 4 {
+                O::join(O::join(e[0], e[1]), O::join(e[2 % K], e[3 % K])) // the order of `columns`
+            } else {
+                e[1..].iter().fold(e[0], |s, v| O::join(s, *v))
+            };
         }
     }
 }

@@ -10,6 +10,7 @@ use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{WindowChannel, WindowParams};
 
 mod along;
+mod columns;
 mod emit;
 mod estimate;
 mod float;
