@@ -207,11 +207,18 @@ macro_rules! plain {
         unsafe impl Plain for $t {}
     )*};
 }
-plain!(u8 u16 u32 u64 u128 f32 f64);
+plain!(u8 i8 u16 i16 u32 i32 u64 u128 f32 f64);
 
 /// Bytes per voxel of the moments of a batch of planes.
 pub fn batch_bytes(dtype: DType, needs: Needs) -> usize {
     let size = dtype.size();
     let sums = if dtype.is_float() { 8 * needs.mean as usize + 8 * needs.variance as usize } else { 0 };
     (2 * size * needs.extremes as usize + sums).max(1)
+}
+
+/// The same numbers as another type of the same size. Panics if the sizes differ.
+pub fn bits<T: Plain, U: Plain>(data: &[U]) -> &[T] {
+    assert!(size_of::<T>() == size_of::<U>() && align_of::<T>() <= align_of::<U>(), "types of one size");
+    // SAFETY: equal size and alignment (asserted), and every bit pattern is a value of both.
+    unsafe { std::slice::from_raw_parts(data.as_ptr().cast(), data.len()) }
 }
