@@ -107,13 +107,16 @@ fn field(dtype: DType, reach: [usize; 3]) -> (Voxels, Shape) {
     (v, shape)
 }
 
+/// Source, place of the output box in it, output, level and scratch.
+type Kernel<'a> = dyn FnMut(AnyView, [usize; 3], &mut Voxels, &mut Context) + 'a;
+
 /// One timed kernel: its source, its buffers, and the call.
 struct Job<'a> {
     src: (Voxels, Shape),
     reach: [usize; 3],
     out: Voxels,
     scratch: Scratch,
-    kernel: Box<dyn FnMut(AnyView, [usize; 3], &mut Voxels, &mut Context) + 'a>,
+    kernel: Box<Kernel<'a>>,
 }
 
 impl<'a> Job<'a> {

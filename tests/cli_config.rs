@@ -191,7 +191,6 @@ fn wrong_lines_are_named_with_value_and_what_would_do() {
         (20, 21, "from = \"ao\"\nreduce = \"median\"", "output.ao.reduce", &["\"mean\""]),
         (20, 21, "from = \"ao\"\nreduce = \"moments\"", "output.ao.reduce", &["variance and std"]),
         (20, 22, "from = \"ao\"\nformat = \"nii\"\nlevels = 2", "output.ao.levels", &["nii holds level 0 only"]),
-        (20, 22, "from = \"ao\"\nformat = \"ome-zarr-0.4\"\nshard = 256", "output.ao.shard", &["no shards"]),
         (
             20,
             22,

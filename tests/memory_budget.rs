@@ -48,8 +48,14 @@ path = "ao.zarr"
 from = "ao"
 "#;
     std::fs::write(&path, text).unwrap();
-    let child =
-        Command::new(program()).arg("run").arg(&path).arg("-q").stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
+    let child = Command::new(program())
+        .arg("run")
+        .arg(&path)
+        .arg("-q")
+        .stdout(Stdio::null())
+        .stderr(Stdio::inherit())
+        .spawn()
+        .unwrap();
     let (peak, status) = peak_of(child);
     assert!(status.success());
     println!("peak {} MiB under a budget of 256 MiB", peak / MIB);
@@ -71,8 +77,14 @@ from = ["stats.mean", "stats.variance"]
 "#;
     let path = dir.path().join("second.toml");
     std::fs::write(&path, second).unwrap();
-    let child =
-        Command::new(program()).arg("run").arg(&path).arg("-q").stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
+    let child = Command::new(program())
+        .arg("run")
+        .arg(&path)
+        .arg("-q")
+        .stdout(Stdio::null())
+        .stderr(Stdio::inherit())
+        .spawn()
+        .unwrap();
     let (peak, status) = peak_of(child);
     assert!(status.success());
     println!("peak {} MiB from Zarr under a budget of 256 MiB", peak / MIB);

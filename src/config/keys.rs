@@ -72,7 +72,8 @@ pub fn op_channels(op: &str) -> &'static [&'static str] {
 }
 
 pub(super) const METHODS: &[&str] = &["exact", "cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal"];
-pub(super) const FORMATS: &[&str] = &["ome-zarr-0.5", "ome-zarr-0.4", "nrrd", "nii", "npy", "raw"];
+pub(super) const FORMATS: &[&str] =
+    &["ome-zarr-0.5", "ome-zarr-0.4", "nrrd", "nii", "npy", "raw", "0.5", "0.4", "zarr3", "zarr2", "nifti"];
 /// Fields that `synthetic` names; the store makes them.
 pub const SYNTHETIC: &[&str] = &["sphere", "plane", "gyroid", "noise", "ramp", "phantom", "constant"];
 

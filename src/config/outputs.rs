@@ -51,14 +51,19 @@ pub fn read(name: &str, node: &Node, base: &Path, names: &Names) -> Result<Outpu
     })
 }
 
-/// Formats in the order of [`FORMATS`].
-const MEANINGS: [OutputFormat; 6] = [
+/// Formats in the order of [`FORMATS`]; the first spelling of each is its name.
+const MEANINGS: [OutputFormat; 11] = [
     OutputFormat::OmeZarr05,
     OutputFormat::OmeZarr04,
     OutputFormat::Nrrd,
     OutputFormat::Nifti,
     OutputFormat::Npy,
     OutputFormat::Raw,
+    OutputFormat::OmeZarr05,
+    OutputFormat::OmeZarr04,
+    OutputFormat::OmeZarr05,
+    OutputFormat::OmeZarr04,
+    OutputFormat::Nifti,
 ];
 
 impl OutputFormat {
@@ -101,10 +106,8 @@ fn format(r: &Reader, path: &Path) -> Result<OutputFormat> {
 fn shard(r: &Reader, chunk: [usize; 3], format: OutputFormat) -> Result<Option<[usize; 3]>> {
     let given = r.has("shard");
     let shard = r.get("shard", read::shard)?;
+    // Zarr v2 and flat files have no shards: the key is for the outputs beside them.
     if format != OutputFormat::OmeZarr05 {
-        if given && shard.is_some() && format == OutputFormat::OmeZarr04 {
-            return Err(r.error("shard", "ome-zarr-0.4 has no shards; expected \"none\" or no such key"));
-        }
         return Ok(None);
     }
     if !given {

@@ -21,6 +21,7 @@ pub mod steps;
 pub mod stream;
 pub mod trace;
 pub mod value;
+pub mod windows;
 
 pub use cancel::Cancel;
 pub use options::{Progress, RunOptions, Silent};

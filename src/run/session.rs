@@ -17,10 +17,10 @@ use super::prepass::MinMax;
 use super::program::Program;
 use super::read::Reader;
 use super::report::{Report, StageReport};
-use super::second;
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
+use super::{second, windows};
 use crate::brick::{Pool, Scratch};
 use crate::config::{Config, config_hash};
 use crate::grid::{Region, order::morton};
@@ -376,7 +376,7 @@ impl<'a> Session<'a> {
                 &self.hash,
                 target.range,
             );
-            let windows = self.windows(o);
+            let windows = windows::of_output(output);
             let Target { sink, levels, cells, .. } = target;
             drop((levels, cells)); // their files go with the work folder
             for k in 0..=output.level_count() {
@@ -395,20 +395,6 @@ impl<'a> Session<'a> {
         }
         self.metrics.sample_memory();
         Ok(self.report())
-    }
-
-    /// Display windows of each component for `omero`.
-    fn windows(&self, o: usize) -> Vec<[f64; 2]> {
-        let output = &self.plan.outputs[o];
-        let (lo, hi) = output.spec.dtype.range();
-        let window = if output.openness && output.spec.dtype.is_float() {
-            [0.0, 1.0]
-        } else if output.spec.dtype.is_float() {
-            [0.0, 1.0]
-        } else {
-            [lo, hi]
-        };
-        vec![window; output.spec.components.unwrap_or(1)]
     }
 
     fn report(&self) -> Report {

@@ -155,8 +155,6 @@ def borders(folder):
     want = over(v.astype(float), 40, openness("cdf_power", False))
     body = "op = 'ambient_occlusion'\nmethod = 'cdf_power'\nradius = 40"
     close("radius beyond the volume", stage(folder, "path = 'a.npy'", body), want, 1e-5)
-    pad = np.pad(v.astype(float), 25, mode="symmetric")
-    want = over(pad, 25, lambda c, w: w.mean())[25:-25, 25:-25, 25:-25] if False else None
     side = round((0.806 * 7 - 1) / 2)
     want = over(v.astype(float), side, openness("chebyshev", False))
     body = "op = 'ambient_occlusion'\nmethod = 'chebyshev'\nradius = 3\nregion = 'equal_volume'"
@@ -167,7 +165,7 @@ def gaussians(folder):
     v = RNG.normal(size=(12, 9, 20)).astype("<f4") + 1000
     np.save(folder / "a.npy", v)
     sigma = (1.0, 0.5, 2.0)
-    d, mean, second = v.astype(float), v.astype(float), None
+    d = v.astype(float)
 
     def blur(x):
         for a, s in enumerate(sigma):
@@ -362,7 +360,7 @@ def formats(folder):
         close(name, plain(f"path = '{name}'"), v, 0)
     u = (v + 1000).astype("u2")
     for name, keys in [("a.tif", {}), ("b.tif", {"compression": "zlib"}), ("c.tif", {"bigtiff": True}), ("d.tif", {"byteorder": ">"}),
-                       ("e.tif", {"tile": (16, 16)}), ("f.tif", {"imagej": True, "metadata": {"spacing": 2.0, "unit": "um"}})]:
+                       ("e.tif", {"tile": (16, 16)}), ("f.tif", {"imagej": True, "metadata": {"axes": "ZYX", "spacing": 2.0, "unit": "um"}})]:
         tifffile.imwrite(folder / name, u, photometric="minisblack", **keys)
         close(f"TIFF {name}", plain(f"path = '{name}'"), u, 0)
     (folder / "slices").mkdir()
@@ -389,18 +387,6 @@ def formats(folder):
     close("NIfTI out", np.asanyarray(back.dataobj).T, v, 0)
     close("NIfTI affine", back.affine, image.affine, 1e-6)
     close("raw out", np.fromfile(folder / "o.raw", "<i2").reshape(v.shape), v, 0)
-
-
-def levels(v, keep=np.nanmean):
-    out = [v]
-    while max(out[-1].shape) > 8:
-        x = out[-1]
-        pad = np.pad(x, [(0, n % 2) for n in x.shape], constant_values=np.nan)
-        s = pad.shape
-        out.append(pad)
-        out[-2:] = [x, pad.reshape(s[0] // 2, 2, s[1] // 2, 2, s[2] // 2, 2)]
-        break
-    return out
 
 
 def pyramids(folder):
@@ -471,8 +457,8 @@ shard = 16
     a = group["1"][:]
     want = np.empty(a.shape)
     for i in np.ndindex(*a.shape):
-        cell = tuple(slice(i[b] * (v.shape[b] + a.shape[b] - 1) // a.shape[b] if False else i[b] * (1 if a.shape[b] == v.shape[b] else 2),
-                           (i[b] + 1) * (1 if a.shape[b] == v.shape[b] else 2)) for b in range(3))
+        f = [1 if a.shape[b] == v.shape[b] else 2 for b in range(3)]
+        cell = tuple(slice(i[b] * f[b], (i[b] + 1) * f[b]) for b in range(3))
         want[i] = var[cell].mean() + mean[cell].var()
     close("pooled variance level 1", a, want, 1e-2)
 

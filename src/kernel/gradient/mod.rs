@@ -227,6 +227,7 @@ const LANES: usize = 8;
 /// Weighted sums over y and z of [`LANES`] columns from `i` on: for component x one row per |dx| = 1, 2, for y and z one
 /// per |dx| = 0, 1, 2. Without `FULL` the rows may end inside the lanes.
 #[inline(always)]
+#[allow(clippy::needless_range_loop)] // offsets index weights and rows alike
 fn weigh_columns<const H: usize, T: Voxel, S: Sum<T>, const FULL: bool>(
     rows: &[[&[T]; 5]; 5],
     missing: Option<T>,

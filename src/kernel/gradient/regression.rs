@@ -57,7 +57,7 @@ fn solve(mut m: [[f64; 4]; 3]) -> Option<[f64; 3]> {
     for _ in 0..3 {
         let p = (0..3).filter(|&i| !done[i]).max_by(|&i, &j| m[i][i].total_cmp(&m[j][j]))?;
         let pivot = m[p][p];
-        if !(pivot > 1e-9 * trace) {
+        if pivot.is_nan() || pivot <= 1e-9 * trace {
             return None;
         }
         done[p] = true;

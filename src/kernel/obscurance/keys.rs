@@ -9,12 +9,8 @@ pub(super) const LANES: usize = 64;
 /// outside get it, so that lines pass through them.
 pub(super) trait Key: Plain + Ord + Default + Send + Sync + 'static {
     const ZERO: Self;
-    const ONE: Self;
     const MAX: Self;
-    fn wrapping_add(self, other: Self) -> Self;
-    fn and(self, other: Self) -> Self;
     fn not(self) -> Self;
-    fn to_usize(self) -> usize;
 }
 
 macro_rules! key {
@@ -23,16 +19,9 @@ macro_rules! key {
         unsafe impl Plain for $t {}
         impl Key for $t {
             const ZERO: Self = 0;
-            const ONE: Self = 1;
             const MAX: Self = <$t>::MAX;
             #[inline(always)]
-            fn wrapping_add(self, other: Self) -> Self { <$t>::wrapping_add(self, other) }
-            #[inline(always)]
-            fn and(self, other: Self) -> Self { self & other }
-            #[inline(always)]
             fn not(self) -> Self { !self }
-            #[inline(always)]
-            fn to_usize(self) -> usize { self as usize }
         }
     )*};
 }

@@ -78,7 +78,9 @@ pub struct ObscuranceIo<'a> {
     pub rgb: Option<[AnyViewMut<'a>; 3]>,
 }
 
-/// Output voxels whose sums are kept at once, `[z, y, x]`: they stay in the third-level cache while all families pass.
+/// Output voxels whose sums are kept at once, `[z, y, x]`. Long lines waste less on halos than sums gain from a nearer
+/// cache: 2-core Zen 4 VM, AVX-512, 2026-11-23, 256^3 u8, 42 directions, distance 64: 0.85 s; `[128, 128, 256]` 0.96 s,
+/// `[64, 128, 256]` 1.21 s, and `[256; 3]` 0.82 s for twice the memory.
 const TILE: Shape = [256, 128, 256];
 
 impl Prepared {

@@ -9,8 +9,10 @@ use crate::kernel::simd::Level;
 pub(super) trait Hit: Copy + Default + Send + Sync + 'static {
     fn of(steps: usize) -> Self;
     fn steps(self) -> usize;
-    /// The same slice if answers are bytes, else an empty one.
+    /// As many bytes in the place of the answers, to be followed by [`Self::widen`].
     fn bytes(answers: &mut [Self]) -> &mut [u8];
+    /// Turns the bytes of [`Self::bytes`] into answers.
+    fn widen(answers: &mut [Self]);
     /// The same slice if answers are bytes.
     fn as_bytes(answers: &[Self]) -> Option<&[u8]>;
 }
@@ -27,6 +29,7 @@ impl Hit for u8 {
     fn bytes(answers: &mut [u8]) -> &mut [u8] {
         answers
     }
+    fn widen(_: &mut [u8]) {}
     #[inline(always)]
     fn as_bytes(answers: &[u8]) -> Option<&[u8]> {
         Some(answers)
@@ -42,8 +45,15 @@ impl Hit for u32 {
     fn steps(self) -> usize {
         self as usize
     }
-    fn bytes(_: &mut [u32]) -> &mut [u8] {
-        &mut []
+    fn bytes(answers: &mut [u32]) -> &mut [u8] {
+        // SAFETY: the place of the answers has four times as many bytes, and every bit pattern is valid for both.
+        unsafe { std::slice::from_raw_parts_mut(answers.as_mut_ptr().cast(), answers.len()) }
+    }
+    fn widen(answers: &mut [u32]) {
+        for i in (0..answers.len()).rev() {
+            // Byte i lies in a word that is still to be written, or in this one.
+            answers[i] = answers[i / 4].to_ne_bytes()[i % 4] as u32;
+        }
     }
     fn as_bytes(_: &[u32]) -> Option<&[u8]> {
         None
@@ -106,8 +116,8 @@ impl<K: Key> Sheet<'_, K> {
     }
 }
 
-/// Reach times bytes of a key up to which brute force beats the stack: it costs about 1/100 ns per step and byte, the
-/// stack 5 to 10 ns.
+/// Reach times bytes of a key up to which brute force (AVX2, SSE2) beats the stack: it costs about 1/100 ns per step and
+/// byte, the stack 10 to 18 ns (2-core Zen 4 VM, 2026-11-23).
 #[cfg(target_arch = "x86_64")]
 const BRUTE: usize = 768;
 
@@ -126,25 +136,94 @@ pub(super) fn both<K: Key, H: Hit>(
     turned: &mut [u8],
 ) {
     #[cfg(target_arch = "x86_64")]
-    if level == Level::Avx512 && size_of::<H>() == 1 {
-        let hits = hits.map(H::bytes);
-        // SAFETY: the level says that the CPU has AVX-512.
-        return unsafe { super::wide::next_greater(sheet, spans, queries, reach, hits, turned) };
+    {
+        let short = reach.min(SHORT);
+        let mut hits = hits;
+        if reach - short <= BEYOND
+            && short_answers(level, sheet, spans, queries.clone(), short, &mut hits, rows, turned)
+        {
+            for (way, hits) in hits.into_iter().enumerate() {
+                H::widen(hits);
+                if reach > short && !hits.is_empty() {
+                    beyond(sheet, queries.clone(), short, reach, way == 0, hits);
+                }
+            }
+            return;
+        }
+        for (way, hits) in hits.into_iter().enumerate().filter(|(_, hits)| !hits.is_empty()) {
+            let rows = &mut rows[..sheet.planes.len() * LANES];
+            sheet.copy_to(rows);
+            stacked(rows, queries.clone(), reach, way == 0, hits, stack);
+        }
     }
-    let _ = (turned, spans);
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        let _ = (level, spans, turned);
+        let rows = &mut rows[..sheet.planes.len() * LANES];
+        sheet.copy_to(rows);
+        for (way, hits) in hits.into_iter().enumerate().filter(|(_, hits)| !hits.is_empty()) {
+            stacked(rows, queries.clone(), reach, way == 0, hits, stack);
+        }
+    }
+}
+
+/// Longest reach whose answers are bytes.
+#[cfg(target_arch = "x86_64")]
+const SHORT: usize = u8::MAX as usize;
+/// Planes after those that are looked at one by one, for the lanes that found nothing: `max_distance = 256` needs one.
+#[cfg(target_arch = "x86_64")]
+const BEYOND: usize = 8;
+
+/// [`both`] by vectors, with answers left as bytes; false if there is no kernel for it and nothing was done.
+#[cfg(target_arch = "x86_64")]
+#[allow(clippy::too_many_arguments)]
+fn short_answers<K: Key, H: Hit>(
+    level: Level,
+    sheet: Sheet<K>,
+    spans: &Spans,
+    queries: Range<usize>,
+    reach: usize,
+    hits: &mut [&mut [H]; 2],
+    rows: &mut [K],
+    turned: &mut [u8],
+) -> bool {
+    if level == Level::Avx512 {
+        let hits = hits.each_mut().map(|h| H::bytes(h));
+        // SAFETY: the level says that the CPU has AVX-512.
+        unsafe { super::wide::next_greater(sheet, spans, queries, reach, hits, turned) };
+        return true;
+    }
+    if reach * size_of::<K>() > BRUTE {
+        return false;
+    }
     let rows = &mut rows[..sheet.planes.len() * LANES];
     sheet.copy_to(rows);
-    for (way, hits) in hits.into_iter().enumerate() {
-        if hits.is_empty() {
-            continue;
+    let asked = hits.iter_mut().enumerate().filter(|(_, hits)| !hits.is_empty());
+    // A kernel is there for both senses or for none.
+    asked.fold(true, |all, (way, hits)| {
+        all && super::narrow::brute(level, rows, queries.clone(), reach, way == 0, H::bytes(hits))
+    })
+}
+
+/// Goes on from `short` to `reach` planes for the lanes that are open so far.
+#[cfg(target_arch = "x86_64")]
+fn beyond<K: Key, H: Hit>(
+    sheet: Sheet<K>,
+    queries: Range<usize>,
+    short: usize,
+    reach: usize,
+    ahead: bool,
+    hits: &mut [H],
+) {
+    for (query, hits) in queries.zip(hits.chunks_exact_mut(LANES)) {
+        let plane = |steps: usize| {
+            let plane = if ahead { query + steps + 1 } else { query.wrapping_sub(steps + 1) };
+            sheet.planes.get(plane).map(|&start| &sheet.data[start..start + LANES])
+        };
+        let keys = &sheet.data[sheet.planes[query]..][..LANES];
+        for (lane, hit) in hits.iter_mut().enumerate().filter(|(_, hit)| hit.steps() == short) {
+            let greater = |steps: &usize| plane(*steps).is_some_and(|keys_there| keys_there[lane] > keys[lane]);
+            *hit = H::of((short..reach).find(greater).unwrap_or(reach));
         }
-        #[cfg(target_arch = "x86_64")]
-        if size_of::<H>() == 1 && reach * size_of::<K>() <= BRUTE {
-            let bytes = H::bytes(&mut *hits);
-            if super::narrow::brute(level, rows, queries.clone(), reach, way == 0, bytes) {
-                continue;
-            }
-        }
-        stacked(rows, queries.clone(), reach, way == 0, hits, stack);
     }
 }

@@ -72,10 +72,15 @@ impl OpenSum<'_> {
         for y in 0..ny {
             for z0 in (0..nz).step_by(TILE) {
                 for x0 in (0..nx).step_by(TILE) {
-                    for z in z0..nz.min(z0 + TILE) {
-                        let to = &mut natural[(z * ny + y) * nx..][..nx];
-                        for x in x0..nx.min(x0 + TILE) {
-                            to[x] += turned[(x * ny + y) * nz + z];
+                    let (tz, tx) = (TILE.min(nz - z0), TILE.min(nx - x0));
+                    let mut part = [[0; TILE]; TILE];
+                    for (x, part) in part[..tx].iter_mut().enumerate() {
+                        part[..tz].copy_from_slice(&turned[((x0 + x) * ny + y) * nz + z0..][..tz]);
+                    }
+                    for z in 0..tz {
+                        let to = &mut natural[((z0 + z) * ny + y) * nx + x0..][..tx];
+                        for (to, part) in to.iter_mut().zip(&part) {
+                            *to += part[z];
                         }
                     }
                 }

@@ -118,6 +118,9 @@ fn every_search_finds_the_next_greater_key() {
             (333, 17, 290, 40),
             (700, 0, 600, 255),
             (700, 30, 700, 699),
+            (600, 0, 600, 256),
+            (600, 70, 500, 260),
+            (400, 0, 400, 254),
         ] {
             let modulus = [3, 40, 1 << 20][(planes + reach) % 3];
             let mut sheet: Vec<K> = (0..planes * LANES).map(|_| of(noise.next() % modulus)).collect();
@@ -138,35 +141,23 @@ fn every_search_finds_the_next_greater_key() {
             let mut stack = vec![0; planes];
             let mut rows = sheet.clone();
             let spans = [[0, (to - from) as u32]; LANES];
+            let mut scratch = Scratch::new();
             #[cfg(target_arch = "x86_64")]
-            let mut scratch = vec![0u64; super::wide::scratch_bytes(planes, to - from, size_of::<K>()) / 8 + 8];
+            let turned = scratch.take(super::wide::scratch_bytes(planes, to - from, size_of::<K>()));
+            #[cfg(not(target_arch = "x86_64"))]
+            let turned = scratch.take(0);
             for level in Level::available() {
                 let mut hits = [0, 1].map(|_| vec![u32::MAX; (to - from) * LANES]);
                 if reach <= 255 {
                     let mut bytes = hits.each_ref().map(|h| vec![7u8; h.len()]);
                     let [f, b] = bytes.each_mut();
-                    // SAFETY: bytes of integers.
-                    let (_, turned, _) = unsafe { scratch.align_to_mut::<[u64; 8]>() };
-                    // SAFETY: as above.
-                    let (_, turned, _) = unsafe { turned.align_to_mut::<u8>() };
-                    let start = turned.as_ptr().align_offset(64);
-                    super::scan::both(
-                        level,
-                        place,
-                        &spans,
-                        from..to,
-                        reach,
-                        [f, b],
-                        &mut rows,
-                        &mut stack,
-                        &mut turned[start..],
-                    );
+                    super::scan::both(level, place, &spans, from..to, reach, [f, b], &mut rows, &mut stack, turned);
                     for (h, b) in hits.iter_mut().zip(&bytes) {
                         h.iter_mut().zip(b).for_each(|(h, b)| *h = *b as u32);
                     }
                 } else {
                     let [f, b] = hits.each_mut();
-                    super::scan::both(level, place, &spans, from..to, reach, [f, b], &mut rows, &mut stack, &mut []);
+                    super::scan::both(level, place, &spans, from..to, reach, [f, b], &mut rows, &mut stack, turned);
                 }
                 for (ahead, hits) in [true, false].into_iter().zip(&hits) {
                     for (i, &got) in hits.iter().enumerate() {

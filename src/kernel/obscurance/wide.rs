@@ -81,7 +81,9 @@ fn round(t: [__m512i; 16]) -> [__m512i; 16] {
 /// 64 rows of `stride` bytes, `stride` at least `count` rounded up to 64; the CPU has AVX-512.
 #[target_feature(enable = "avx512f,avx512bw")]
 unsafe fn turn_back(answers: *const u8, stride: usize, count: usize, hits: &mut [u8]) {
+    assert!(hits.len() >= count * LANES);
     for block in (0..count).step_by(64) {
+        let whole = block + 64 <= count;
         for group in 0..4 {
             // SAFETY: inside the 64 rows of `stride` bytes.
             let rows = std::array::from_fn(|i| unsafe {
@@ -96,10 +98,9 @@ unsafe fn turn_back(answers: *const u8, stride: usize, count: usize, hits: &mut 
                 ];
                 for (l, quarter) in quarters.into_iter().enumerate() {
                     let query = block + l * 16 + j;
-                    if query < count {
-                        let to = &mut hits[query * LANES + group * 16..][..16];
-                        // SAFETY: `to` has 16 bytes.
-                        unsafe { _mm_storeu_si128(to.as_mut_ptr().cast(), quarter) };
+                    if whole || query < count {
+                        // SAFETY: 16 bytes of the row of a query below `count`; `hits` has `count` rows.
+                        unsafe { _mm_storeu_si128(hits.as_mut_ptr().add(query * LANES + group * 16).cast(), quarter) };
                     }
                 }
             }
@@ -240,23 +241,24 @@ macro_rules! search {
                     if !hits[0].is_empty() {
                         let mut answer = limit;
                         let mut open: $mask = !0;
-                        for k in 0..(blocks - home + 1).min(around) {
-                            if k > 0 && open == 0 {
+                        let rounds = (blocks - home + 1).min(around);
+                        for k in 0..rounds {
+                            let (near, far) = (home + k, home + k + 1);
+                            if $mask_gt(open, $set1(top(near) as $lane_type), key) != 0 {
+                                let mut at = $add(lane, one);
+                                for s in (0..LEVELS).rev() {
+                                    let m = $permute(table(near, s), at, table(far, s));
+                                    at = $mask_add(at, $le(m, key), at, number(1 << s));
+                                }
+                                let found = $mask_gt(open, $permute(table(near, 0), at, table(far, 0)), key);
+                                let steps = $add($sub(at, $add(lane, one)), number(k * R));
+                                answer = $blend(found, answer, steps);
+                                open &= !found;
+                            }
+                            // Asked in this order: the second question cannot be predicted.
+                            if k + 1 < rounds && open == 0 {
                                 break;
                             }
-                            let (near, far) = (home + k, home + k + 1);
-                            if $mask_gt(open, $set1(top(near) as $lane_type), key) == 0 {
-                                continue;
-                            }
-                            let mut at = $add(lane, one);
-                            for s in (0..LEVELS).rev() {
-                                let m = $permute(table(near, s), at, table(far, s));
-                                at = $mask_add(at, $le(m, key), at, number(1 << s));
-                            }
-                            let found = $mask_gt(open, $permute(table(near, 0), at, table(far, 0)), key);
-                            let steps = $add($sub(at, $add(lane, one)), number(k * R));
-                            answer = $blend(found, answer, steps);
-                            open &= !found;
                         }
                         // SAFETY: R bytes of the row of this line.
                         unsafe {
@@ -266,25 +268,25 @@ macro_rules! search {
                     if !hits[1].is_empty() {
                         let mut answer = limit;
                         let mut open: $mask = !0;
-                        for k in 0..home.min(around) {
-                            if k > 0 && open == 0 {
+                        let rounds = home.min(around);
+                        for k in 0..rounds {
+                            let (far, near) = (home - k - 1, home - k);
+                            if $mask_gt(open, $set1(top(far) as $lane_type), key) != 0 {
+                                let mut at = $add(lane, past);
+                                for s in (0..LEVELS).rev() {
+                                    let before = $sub(at, number(1 << s));
+                                    let m = $permute(table(far, s), before, table(near, s));
+                                    at = $blend($le(m, key), at, before);
+                                }
+                                let m = $permute(table(far, 0), $sub(at, one), table(near, 0));
+                                let found = $mask_gt(open, m, key);
+                                let steps = $add($sub($add(lane, past), at), number(k * R));
+                                answer = $blend(found, answer, steps);
+                                open &= !found;
+                            }
+                            if k + 1 < rounds && open == 0 {
                                 break;
                             }
-                            let (far, near) = (home - k - 1, home - k);
-                            if $mask_gt(open, $set1(top(far) as $lane_type), key) == 0 {
-                                continue;
-                            }
-                            let mut at = $add(lane, past);
-                            for s in (0..LEVELS).rev() {
-                                let before = $sub(at, number(1 << s));
-                                let m = $permute(table(far, s), before, table(near, s));
-                                at = $blend($le(m, key), at, before);
-                            }
-                            let m = $permute(table(far, 0), $sub(at, one), table(near, 0));
-                            let found = $mask_gt(open, m, key);
-                            let steps = $add($sub($add(lane, past), at), number(k * R));
-                            answer = $blend(found, answer, steps);
-                            open &= !found;
                         }
                         // SAFETY: as above.
                         unsafe {

@@ -52,21 +52,15 @@ fn move_inner(keys: &[i8], valid: Option<&[i8]>, plan: &Plan, [z, y]: [usize; 2]
     let exists = |at: usize| valid.is_none_or(|v| v[at] != 0);
     for x in existing(plan) {
         let column: &mut [u16; BINS] = (&mut columns[x * BINS..(x + 1) * BINS]).try_into().unwrap();
+        if leaving.len() == 1 && entering.len() == 1 && valid.is_none() {
+            exchange(column, keys, zs.clone().map(|sz| [place(sz, leaving.start) + x, place(sz, entering.start) + x]));
+            continue;
+        }
         let mut count = |key: i8, by: u16| {
             let bin = bin(key);
             column[bin] = column[bin].wrapping_add(by);
             column[256 + bin / 16] = column[256 + bin / 16].wrapping_add(by);
         };
-        if leaving.len() == 1 && entering.len() == 1 && valid.is_none() {
-            for sz in zs.clone() {
-                let (out, into) = (keys[place(sz, leaving.start) + x], keys[place(sz, entering.start) + x]);
-                if out != into {
-                    count(out, u16::MAX);
-                    count(into, 1);
-                }
-            }
-            continue;
-        }
         for sz in zs.clone() {
             for at in leaving.clone().map(|sy| place(sz, sy) + x).filter(|at| exists(*at)) {
                 count(keys[at], u16::MAX);
@@ -78,7 +72,38 @@ fn move_inner(keys: &[i8], valid: Option<&[i8]>, plan: &Plan, [z, y]: [usize; 2]
     }
 }
 
+/// 1 in one of 16 bins.
+const ONE: [[u16; 16]; 16] = {
+    let mut one = [[0; 16]; 16];
+    let mut b = 0;
+    while b < 16 {
+        one[b][b] = 1;
+        b += 1;
+    }
+    one
+};
+
+/// Takes the first key of each pair out of a column and puts the second one in. Neighbours share coarse bins, so those are
+/// summed in registers: one counter after another in memory would wait for each store.
+#[inline(always)]
+fn exchange(column: &mut [u16; BINS], keys: &[i8], pairs: impl Iterator<Item = [usize; 2]>) {
+    let mut coarse: [u16; 16] = column[256..].try_into().unwrap();
+    for [out, into] in pairs {
+        let (out, into) = (bin(keys[out]), bin(keys[into]));
+        if out != into {
+            column[out] = column[out].wrapping_sub(1);
+            column[into] = column[into].wrapping_add(1);
+            let (less, more) = (&ONE[out / 16], &ONE[into / 16]);
+            for b in 0..16 {
+                coarse[b] = coarse[b].wrapping_sub(less[b]).wrapping_add(more[b]);
+            }
+        }
+    }
+    column[256..].copy_from_slice(&coarse);
+}
+
 /// Histogram of the window about one voxel of a row.
+#[derive(Default)]
 pub(super) struct Window {
     coarse: [u32; 16],
     fine: [[u32; 16]; 16],
@@ -86,23 +111,19 @@ pub(super) struct Window {
     upto: [usize; 16],
 }
 
-impl Default for Window {
-    fn default() -> Self {
-        Window { coarse: [0; 16], fine: [[0; 16]; 16], upto: [0; 16] }
-    }
-}
-
 multiversion! {
     /// Counts for up to [`MOST_LANES`] voxels of an output row from `[z, y, x]` on. Runs of a row must follow each other,
-    /// with the same window.
+    /// with the same window. Without `gaps` the counts hold n already.
     pub(super) fn count[](
-        keys: &[i8], plan: &Plan, place: [usize; 3], columns: &[u16], window: &mut Window, counts: &mut Counts,
+        keys: &[i8], gaps: bool, plan: &Plan, place: [usize; 3], columns: &[u16], window: &mut Window,
+        counts: &mut Counts,
     ) -> () = count_inner;
 }
 
 #[inline(always)]
 fn count_inner(
     keys: &[i8],
+    gaps: bool,
     plan: &Plan,
     [z, y, x]: [usize; 3],
     columns: &[u16],
@@ -124,27 +145,31 @@ fn count_inner(
             sub(&mut window.coarse, part(x - 1, 256));
         }
         let bin = bin(keys[centres + x]);
-        let (coarse, fine) = (bin / 16, &mut window.fine[bin / 16]);
+        let coarse = bin / 16;
+        let mut fine = window.fine[coarse]; // a copy, so that it stays in a register
         let behind = x + 1 - window.upto[coarse];
         if window.upto[coarse] > 0 && 2 * behind < span {
             for step in x + 1 - behind..x + 1 {
                 if exist.contains(&(step + span - 1)) {
-                    add(fine, part(step + span - 1, bin / 16 * 16));
+                    add(&mut fine, part(step + span - 1, bin / 16 * 16));
                 }
                 if exist.contains(&(step - 1)) {
-                    sub(fine, part(step - 1, bin / 16 * 16));
+                    sub(&mut fine, part(step - 1, bin / 16 * 16));
                 }
             }
         } else {
-            *fine = [0; 16];
+            fine = [0; 16];
             for column in x.max(exist.start)..(x + span).min(exist.end) {
-                add(fine, part(column, bin / 16 * 16));
+                add(&mut fine, part(column, bin / 16 * 16));
             }
         }
         window.upto[coarse] = x + 1;
-        let n: u32 = window.coarse.iter().sum();
-        let below = sum_before(&window.coarse, coarse) + sum_before(fine, bin % 16);
-        counts.n[i] = n;
+        window.fine[coarse] = fine;
+        let below = sum_before(&window.coarse, coarse) + sum_before(&fine, bin % 16);
+        if gaps {
+            counts.n[i] = window.coarse.iter().sum();
+        }
+        let n = counts.n[i];
         counts.not_below[i] = n - below;
         counts.above[i] = n - below - fine[bin % 16];
     }

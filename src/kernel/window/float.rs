@@ -3,7 +3,7 @@
 
 use super::emit::{Emit, polarity, put_moment, put_openness, repair, spread_of};
 use super::float_estimate::{self as est, Centre};
-use super::int::{blocked, rows_extremes};
+use super::int::{blocked, deep_len, rows_extremes};
 use super::lines::{self, Add, Coding, Elem, Hi, Lines, Lo, Masked, Op, Sources};
 use super::merge::{Moments, Sum, Wanted, gather, grow, tree_merge};
 use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
@@ -28,6 +28,8 @@ impl Float for f64 {
 }
 
 /// Columns that go through z together: wide enough for the prefetcher, narrow enough for the tree to stay in L2.
+/// 2-core Zen 4 VM, AVX-512, 2026-11-23: mean of f32, r=10, 7.6 ns/voxel with 256 columns and column counts
+/// made once per tile, 10.9 with 64 and counts per row (the two were not measured apart; 64 for the rest is by size).
 fn columns(job: &Job) -> usize {
     if job.needs.variance || job.window[0] > 32 { 64 } else { 256 }
 }
@@ -36,7 +38,7 @@ fn columns(job: &Job) -> usize {
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
-    let rows = padded::<T>(2 * job.pitch) + 2 * padded::<T>(job.tile[1]);
+    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1]);
     Emit::bytes(job.tile[1]) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
 }
 
@@ -110,6 +112,7 @@ pub fn run<T: Float>(
     let row_lo = cut::<T>(bytes, k * job.rows * job.pitch);
     let row_hi = cut::<T>(bytes, k * job.rows * job.pitch);
     let work = cut::<T>(bytes, k * 2 * job.pitch);
+    let deep = cut::<T>(bytes, k * deep_len(job));
     let out_lo = cut::<T>(bytes, k * job.tile[1]);
     let out_hi = cut::<T>(bytes, k * job.tile[1]);
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
@@ -124,7 +127,7 @@ pub fn run<T: Float>(
         b.planes.clear();
         for z0 in (0..dst[0]).step_by(job.batch) {
             if needs.extremes {
-                planes_extremes(level, job, &tile, src, z0, lo, hi);
+                planes_extremes(level, job, &tile, src, z0, lo, hi, deep);
             }
             if needs.mean {
                 planes_moments(level, wanted, job, &tile, src, z0, &mut b);
@@ -139,7 +142,7 @@ pub fn run<T: Float>(
                     if needs.extremes {
                         if j % job.rows == 0 {
                             let from = [&lo[plane..plane + job.plane()], &hi[plane..plane + job.plane()]];
-                            rows_extremes(level, job, from, j, plain, row_lo, row_hi);
+                            rows_extremes(level, job, from, j, plain, row_lo, row_hi, deep);
                         }
                         let line = (j % job.rows) * job.pitch;
                         let w = job.window[2];
@@ -217,6 +220,7 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
 }
 
 /// Extremes over z of a batch of output planes, straight from `src`. NaN never wins a comparison, so it does not count.
+#[allow(clippy::too_many_arguments)]
 fn planes_extremes<T: Float>(
     level: Level,
     job: &Job,
@@ -225,20 +229,34 @@ fn planes_extremes<T: Float>(
     z0: usize,
     lo: &mut [T],
     hi: &mut [T],
+    work: &mut [T],
 ) {
     let cols = tile.cols.1 - tile.cols.0;
     let plain = Coding { flip: T::default(), missing: T::default() };
-    let blocks = (0..job.batch).step_by(job.block);
-    for (j, k) in (tile.rows.0..tile.rows.1).flat_map(|j| blocks.clone().map(move |k| (j, k))) {
+    for j in tile.rows.0..tile.rows.1 {
         let lines = Lines {
             base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
             pitch: src.plane,
-            first: (job.at[0] + z0 + k) as isize - job.radius[0] as isize,
+            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
             clip: (0, job.src[0] as isize),
         };
-        let out = (tile.span(job, j).start + k * job.plane(), job.plane());
+        let out = (tile.span(job, j).start, job.plane());
         let (w, from) = (job.window[0], [src.data; 2]);
-        blocked(level, job.block, Masked::<false>, Sources::<false>, from, lines, w, cols, plain, lo, hi, out);
+        blocked(
+            level,
+            (job.batch, job.block),
+            Masked::<false>,
+            Sources::<false>,
+            from,
+            lines,
+            w,
+            cols,
+            plain,
+            lo,
+            hi,
+            out,
+            work,
+        );
     }
 }
 

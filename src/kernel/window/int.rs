@@ -146,7 +146,7 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
 ) -> usize {
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
-    let rows = padded::<T>(2 * job.pitch) + 2 * padded::<T>(job.tile[1]);
+    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1]);
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
@@ -304,6 +304,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let row_lo = cut::<T>(bytes, k * job.rows * job.pitch);
     let row_hi = cut::<T>(bytes, k * job.rows * job.pitch);
     let work = cut::<T>(bytes, k * 2 * job.pitch);
+    let deep = cut::<T>(bytes, k * deep_len(job));
     let out_lo = cut::<T>(bytes, k * job.tile[1]);
     let out_hi = cut::<T>(bytes, k * job.tile[1]);
     let mut s1 = Moment::<Z1, Y1, X1>::cut(job, needs.mean, bytes);
@@ -354,7 +355,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
         }
         for z0 in (0..job.dst[0]).step_by(job.batch) {
             if needs.extremes {
-                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi);
+                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep);
             }
             for z in z0..(z0 + job.batch).min(job.dst[0]) {
                 let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
@@ -376,7 +377,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                     if needs.extremes {
                         if j % job.rows == 0 {
                             let from = [&lo[plane..plane + job.plane()], &hi[plane..plane + job.plane()]];
-                            rows_extremes(level, job, from, j, plain, row_lo, row_hi);
+                            rows_extremes(level, job, from, j, plain, row_lo, row_hi, deep);
                         }
                         let line = (j % job.rows) * job.pitch;
                         let w = job.window[2];
@@ -428,6 +429,7 @@ fn planes_extremes<T: Code, const M: bool>(
     coding: Coding<T>,
     lo: &mut [T],
     hi: &mut [T],
+    work: &mut [T],
 ) {
     let cols = tile.cols.1 - tile.cols.0;
     for j in tile.rows.0..tile.rows.1 {
@@ -440,7 +442,7 @@ fn planes_extremes<T: Code, const M: bool>(
         let out = (tile.span(job, j).start, job.plane());
         blocked(
             level,
-            job.batch,
+            (job.batch, job.block),
             Masked::<M>,
             Sources::<false>,
             [src.data; 2],
@@ -451,11 +453,13 @@ fn planes_extremes<T: Code, const M: bool>(
             lo,
             hi,
             out,
+            work,
         );
     }
 }
 
 /// Extremes over y of a block of output rows from `j` on.
+#[allow(clippy::too_many_arguments)]
 pub fn rows_extremes<T: Elem>(
     level: Level,
     job: &Job,
@@ -464,17 +468,32 @@ pub fn rows_extremes<T: Elem>(
     plain: Coding<T>,
     lo: &mut [T],
     hi: &mut [T],
+    work: &mut [T],
 ) {
     let lines = Lines { base: 0, pitch: job.pitch, first: j as isize, clip: (0, job.height as isize) };
     let (w, out) = (job.window[1], (0, job.pitch));
-    blocked(level, job.rows, Masked::<false>, Sources::<true>, from, lines, w, job.pitch, plain, lo, hi, out);
+    blocked(
+        level,
+        (job.rows, job.row_block),
+        Masked::<false>,
+        Sources::<true>,
+        from,
+        lines,
+        w,
+        job.pitch,
+        plain,
+        lo,
+        hi,
+        out,
+        work,
+    );
 }
 
-/// [`lines::extremes`] for a block length known at run time.
+/// Extremes of `outputs` lines from `lines` on, by blocks of a length known at run time, or by [`lines::deep_extremes`].
 #[allow(clippy::too_many_arguments)]
 pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
     level: Level,
-    block: usize,
+    (outputs, block): (usize, usize),
     masked: Masked<M>,
     sources: Sources<TWO>,
     src: [&[T]; 2],
@@ -485,11 +504,25 @@ pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
     lo: &mut [T],
     hi: &mut [T],
     out: (usize, usize),
+    work: &mut [T],
 ) {
-    match block {
-        1 => lines::extremes(level, Block::<1>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
-        4 => lines::extremes(level, Block::<4>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
-        8 => lines::extremes(level, Block::<8>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
-        _ => unreachable!("blocks are 1, 4 or 8 lines"),
+    if w >= lines::DEEP && block == 8 && outputs > 8 && cols >= T::CHUNK.as_ref().len() {
+        lines::deep_extremes(level, masked, sources, src, lines, w, cols, coding, outputs / 8, lo, hi, out, work);
+        return;
     }
+    for k in (0..outputs).step_by(block) {
+        let lines = Lines { first: lines.first + k as isize, ..lines };
+        let out = (out.0 + k * out.1, out.1);
+        match block {
+            1 => lines::extremes(level, Block::<1>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
+            4 => lines::extremes(level, Block::<4>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
+            8 => lines::extremes(level, Block::<8>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
+            _ => unreachable!("blocks are 1, 4 or 8 lines"),
+        }
+    }
+}
+
+/// Elements of work that both axes of [`blocked`] need.
+pub fn deep_len(job: &Job) -> usize {
+    lines::deep_len(job.window[0].max(job.window[1]), job.batch.max(job.rows) / 8, job.pitch)
 }

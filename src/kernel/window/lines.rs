@@ -222,16 +222,102 @@ fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
         left[k] = join_line::<T, M, TWO>(left[k + 1], src, lines.start(k) + x, coding);
     }
     let mut right = nothing;
-    for k in 0..B {
+    for (k, l) in left.iter().enumerate() {
         if k > 0 {
             right = join_line::<T, M, TWO>(right, src, lines.start(w + k - 1) + x, coding);
         }
         let start = out.0 + k * out.1 + x;
         let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
-        let (l, r) = (left[k], right);
         for i in 0..chunk {
-            to_lo[i] = l.0.as_ref()[i].lo(r.0.as_ref()[i]);
-            to_hi[i] = l.1.as_ref()[i].hi(r.1.as_ref()[i]);
+            to_lo[i] = l.0.as_ref()[i].lo(right.0.as_ref()[i]);
+            to_hi[i] = l.1.as_ref()[i].hi(right.1.as_ref()[i]);
+        }
+    }
+}
+
+/// Windows from which [`deep_extremes`] pays: below, a core of at most 25 lines is joined directly.
+/// 2-core Zen 4 VM, AVX-512, 2026-11-23: cdf_power of u16, r=64, 11.9 ns/voxel against 23.1 with [`extremes`] alone.
+pub const DEEP: usize = 33;
+
+/// Elements of `work` that [`deep_extremes`] needs.
+pub fn deep_len(w: usize, blocks: usize, cols: usize) -> usize {
+    2 * cols * (w / 8 + blocks + 1)
+}
+
+crate::multiversion! {
+    /// [`extremes`] for long windows (`w >= DEEP`) and `8 * blocks` outputs: the extremes of each group of 8 lines are
+    /// made once, so a block reads its groups, and lines only at the window's ends. Whole lines are walked, since a
+    /// column of far planes would defeat the prefetcher. `cols` is at least a chunk.
+    pub fn deep_extremes[T: Elem, const M: bool, const TWO: bool](
+        masked: Masked<M>, sources: Sources<TWO>, src: [&[T]; 2], lines: Lines, w: usize, cols: usize,
+        coding: Coding<T>, blocks: usize, lo: &mut [T], hi: &mut [T], out: (usize, usize), work: &mut [T]
+    ) -> () = deep_inner;
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
+    _: Masked<M>,
+    _: Sources<TWO>,
+    src: [&[T]; 2],
+    lines: Lines,
+    w: usize,
+    cols: usize,
+    coding: Coding<T>,
+    blocks: usize,
+    lo: &mut [T],
+    hi: &mut [T],
+    out: (usize, usize),
+    work: &mut [T],
+) {
+    let chunk = T::CHUNK.as_ref().len();
+    let mut nothing = (T::CHUNK, T::CHUNK);
+    nothing.0.as_mut().fill(T::GREATEST);
+    nothing.1.as_mut().fill(T::LEAST);
+    // Whole groups that all windows of a block hold: lines 8..8 + 8 groups of the block.
+    let groups = (w - 8) / 8;
+    let steps = cols.div_ceil(chunk);
+    for g in 1..blocks + groups {
+        for s in 0..steps {
+            let x = (s * chunk).min(cols - chunk);
+            let mut m = nothing;
+            for i in 8 * g..8 * g + 8 {
+                m = join_line::<T, M, TWO>(m, src, lines.start(i) + x, coding);
+            }
+            work[2 * g * cols + x..][..chunk].copy_from_slice(m.0.as_ref());
+            work[(2 * g + 1) * cols + x..][..chunk].copy_from_slice(m.1.as_ref());
+        }
+    }
+    for q in 0..blocks {
+        for s in 0..steps {
+            let x = (s * chunk).min(cols - chunk);
+            let mut core = nothing;
+            for g in q + 1..q + 1 + groups {
+                let (a, b) = (&work[2 * g * cols + x..][..chunk], &work[(2 * g + 1) * cols + x..][..chunk]);
+                for i in 0..chunk {
+                    core.0.as_mut()[i] = core.0.as_ref()[i].lo(a[i]);
+                    core.1.as_mut()[i] = core.1.as_ref()[i].hi(b[i]);
+                }
+            }
+            let mut left = [core; 9];
+            for k in (0..8).rev() {
+                left[k] = join_line::<T, M, TWO>(left[k + 1], src, lines.start(8 * q + k) + x, coding);
+            }
+            let mut right = nothing;
+            for i in 8 + 8 * groups..w {
+                right = join_line::<T, M, TWO>(right, src, lines.start(8 * q + i) + x, coding);
+            }
+            for (k, l) in left[..8].iter().enumerate() {
+                if k > 0 {
+                    right = join_line::<T, M, TWO>(right, src, lines.start(8 * q + w + k - 1) + x, coding);
+                }
+                let start = out.0 + (8 * q + k) * out.1 + x;
+                let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
+                for i in 0..chunk {
+                    to_lo[i] = l.0.as_ref()[i].lo(right.0.as_ref()[i]);
+                    to_hi[i] = l.1.as_ref()[i].hi(right.1.as_ref()[i]);
+                }
+            }
         }
     }
 }
@@ -277,6 +363,7 @@ fn join_at_inner<E: Copy, O: Op<E>>(_: O, src: &[E], offsets: &[usize], out: &mu
 }
 
 #[inline(always)]
+#[allow(clippy::needless_range_loop)] // one index for many slices is what vectorises
 fn join_k<E: Copy, O: Op<E>, const K: usize>(src: &[E], offsets: &[usize], out: &mut [E], onto: bool) {
     let n = out.len();
     let t: [&[E]; K] = std::array::from_fn(|k| &src[offsets[k]..offsets[k] + n]);
@@ -419,11 +506,33 @@ mod tests {
                 for x in 0..cols {
                     let window = || {
                         let line = |i: usize| 1 + (i as isize - 4).clamp(2, 36) as usize * pitch + x;
-                        (k..k + w).map(move |i| line(i)).map(|i| src[i] ^ 0x80).filter(|v| !M || *v != 9)
+                        (k..k + w).map(line).map(|i| src[i] ^ 0x80).filter(|v| !M || *v != 9)
                     };
                     assert_eq!(lo[k * pitch + x], window().min().unwrap_or(255), "{level:?} {B} {w} {cols} {k} {x}");
                     assert_eq!(hi[k * pitch + x], window().max().unwrap_or(0));
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn deep_extremes_equal_plain_ones() {
+        let pitch = 96;
+        let src: Vec<u16> = (0..400 * pitch).map(|i: usize| (i.wrapping_mul(2_654_435_761) >> 9) as u16).collect();
+        let lines = Lines { base: 0, pitch, first: -9, clip: (0, 190) };
+        let coding = Coding { flip: 0x8000, missing: 1234 };
+        let (m, s, plain) =
+            (Masked::<true>, Sources::<false>, |k: usize| Lines { first: -9 + 8 * k as isize, ..lines });
+        for level in Level::available() {
+            for w in [33, 35, 40, 64, 129, 301] {
+                let [mut lo, mut hi, mut a, mut b] = [(); 4].map(|()| vec![0u16; 32 * pitch]);
+                let mut work = vec![0u16; deep_len(w, 4, 90)];
+                deep_extremes(level, m, s, [&src; 2], lines, w, 90, coding, 4, &mut lo, &mut hi, (0, pitch), &mut work);
+                for k in 0..4 {
+                    let out = (8 * k * pitch, pitch);
+                    extremes(level, Block::<8>, m, s, [&src; 2], plain(k), w, 90, coding, &mut a, &mut b, out);
+                }
+                assert!(lo == a && hi == b, "{level:?} {w}");
             }
         }
     }

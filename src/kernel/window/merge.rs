@@ -339,7 +339,7 @@ fn merge_at_inner<A: Sum>(
 }
 
 #[inline(always)]
-#[allow(clippy::too_many_arguments)]
+#[allow(clippy::too_many_arguments, clippy::needless_range_loop)]
 fn merge_k<A: Sum, const K: usize, const ONTO: bool>(
     s: &[A],
     m: &[f64],

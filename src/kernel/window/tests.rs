@@ -197,7 +197,7 @@ fn scaled_values_low_solid_and_missing_voxels() {
             v[i] = T::from_f64(x);
         }
         for i in 0..volume.len() {
-            if next() % 5 == 0 || (4 * plane..6 * plane).contains(&i) {
+            if next().is_multiple_of(5) || (4 * plane..6 * plane).contains(&i) {
                 crate::with_voxels!(&mut volume, v => set(v, i, gone));
             }
         }

@@ -1,0 +1,67 @@
+//! Display windows for viewers (`omero`): percentiles of the coarsest level, which is small and already written.
+
+use crate::brick::Voxels;
+use crate::config::{Input, InputKind, Place, Select};
+use crate::grid::Region;
+use crate::plan::OutputPlan;
+use crate::store::Source;
+use crate::store::source::ChunkRead;
+
+/// Share of voxels that may lie beyond each end.
+const TAIL: f64 = 0.01;
+/// Voxels looked at per component at most: larger levels (an explicit `levels = 1`) are sampled by whole chunks.
+const MOST: usize = 4 << 20;
+
+/// One window per component, in the units of the stored numbers. What cannot be read gets the type's range: a window is a
+/// convenience, never a reason to fail.
+pub fn of_output(output: &OutputPlan) -> Vec<[f64; 2]> {
+    let components = output.spec.components.unwrap_or(1);
+    let fallback = if output.spec.dtype.is_float() { [0.0, 1.0] } else { output.spec.dtype.range().into() };
+    let source = if output.is_zarr() { Source::open(&coarsest(output)).ok() } else { None };
+    (0..components).map(|c| source.as_ref().and_then(|s| window(s, c)).unwrap_or(fallback)).collect()
+}
+
+fn coarsest(output: &OutputPlan) -> Input {
+    Input {
+        name: output.spec.name.clone(),
+        place: Place::default(),
+        kind: InputKind::Path { path: output.spec.path.clone(), raw: None },
+        level: output.spec.pyramid.levels.len() - 1,
+        array: None,
+        channel: Select::All,
+        time: Select::Index(0),
+        spacing: None,
+        unit: None,
+        origin: None,
+        slope: None,
+        intercept: None,
+        nodata: None,
+    }
+}
+
+/// The values that cut off [`TAIL`] at each end.
+fn window(source: &Source, component: usize) -> Option<[f64; 2]> {
+    let info = source.info();
+    let chunk = info.chunk?;
+    let whole = Region::whole(info.shape);
+    let cells: Vec<[i64; 3]> = whole.cells([0; 3], chunk).iter().collect();
+    let step = (info.voxels() / MOST + 1).min(cells.len().max(1));
+    let mut values = Vec::new();
+    for index in cells.into_iter().step_by(step) {
+        let mut voxels = Voxels::zeroed(info.dtype, chunk.iter().product());
+        let part = Region::of_cell(index, [0; 3], chunk).clip(&whole);
+        match source.read_chunk(component, index, &mut voxels).ok()? {
+            ChunkRead::Missing(v) => values.push(v),
+            ChunkRead::Data { .. } => {
+                let view = voxels.view(chunk);
+                let n = part.shape();
+                values.extend(Region::whole(n).iter().map(|i| view.at_f64(i.map(|v| v as usize))));
+            }
+        }
+    }
+    values.retain(|v| v.is_finite());
+    values.sort_by(f64::total_cmp);
+    let at = |share: f64| values.get((share * (values.len().saturating_sub(1)) as f64).round() as usize).copied();
+    let (lo, hi) = (at(TAIL)?, at(1.0 - TAIL)?);
+    Some(if hi > lo { [lo, hi] } else { [lo, lo + 1.0] })
+}
