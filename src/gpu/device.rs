@@ -93,7 +93,7 @@ pub fn open(kind: GpuKind) -> Result<(Device, GpuFacts), String> {
     let facts = GpuFacts {
         name: info.name.clone(),
         software: info.device_type == wgpu::DeviceType::Cpu,
-        most_bytes: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size as u64).min(1 << 30),
+        most_bytes: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(1 << 30),
     };
     let (layout, pipelines) = pipelines(&device)?;
     let slots = (0..SLOTS).map(|_| Slot::default()).collect();

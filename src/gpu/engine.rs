@@ -32,10 +32,10 @@ impl std::error::Error for GpuError {}
 /// Seconds of the phases of a call, summed over its parts.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Times {
-    /// Packing into the mapped upload buffer.
-    pub upload: f64,
-    /// From submission until the results are mapped: copies, passes, waiting for the other slot.
-    pub compute: f64,
+    /// Making and mapping buffers, packing voxels into them.
+    pub pack: f64,
+    /// From submission until the results are mapped: copy to the device, passes, copy back, and the other slot's work.
+    pub device: f64,
     /// From mapped sums to results, on the CPU.
     pub finish: f64,
 }
@@ -196,15 +196,16 @@ fn on_device(
     map(device, slot.upload.get(), wgpu::MapMode::Write, sizes.upload(), None)?;
     fill(slot.upload.get(), job, part, &quantities, src, sizes)?;
     slot.upload.get().unmap();
-    times.upload += start.elapsed().as_secs_f64();
+    times.pack += start.elapsed().as_secs_f64();
     let start = Instant::now();
     let index = submit(device, held, job, part, &quantities, sizes);
     let read = held.slot.read.get();
     map(device, read, wgpu::MapMode::Read, sizes.read, Some(index))?;
-    times.compute += start.elapsed().as_secs_f64();
+    times.device += start.elapsed().as_secs_f64();
     let start = Instant::now();
     {
-        let bytes = read.get_mapped_range(0..sizes.read).map_err(|e| GpuError(format!("cannot read results: {e:?}")))?;
+        let bytes =
+            read.get_mapped_range(0..sizes.read).map_err(|e| GpuError(format!("cannot read results: {e:?}")))?;
         let windows = windows(&bytes, part, &quantities)?;
         finish(src, params, job.at, outs, &windows, cx);
     }

@@ -34,13 +34,19 @@ impl GpuFacts {
     }
 }
 
+const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
+
 /// Whether a step has a GPU kernel, or why not. `input` is the wire that the step reads.
 pub fn supports(step: &Step, input: &Wire) -> Result<(), &'static str> {
-    let StepKind::Window { channels, .. } = &step.kind else {
-        return Err("no GPU kernel for this kind of stage: runs on the CPU");
+    let channels = match &step.kind {
+        StepKind::Window { channels, .. } => channels,
+        StepKind::Rank { .. } => return Err(EXACT),
+        _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
     };
     if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {
-        return Err("the border's constant turns the voxels to floats, for which there is no GPU kernel: runs on the CPU");
+        return Err(
+            "the border's constant turns the voxels to floats, for which there is no GPU kernel: runs on the CPU",
+        );
     }
     window(input.dtype, input.missing.is_some(), channels)
 }
@@ -48,7 +54,7 @@ pub fn supports(step: &Step, input: &Wire) -> Result<(), &'static str> {
 /// Whether windows of this type have a GPU kernel, or why not.
 pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result<(), &'static str> {
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Exact, _))) {
-        return Err("no GPU kernel for exact openness: runs on the CPU");
+        return Err(EXACT);
     }
     match dtype {
         DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {

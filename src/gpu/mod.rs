@@ -12,3 +12,18 @@ mod slot;
 
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind, supports};
+
+use crate::config::Device;
+
+/// Opens the GPU that a config's `run.device` means, keeps it in `opened`, and says what it is.
+///
+/// # Errors
+/// What was looked for and what was found.
+pub fn find(device: Device, opened: &mut Option<Gpu>) -> Result<GpuFacts, String> {
+    let kind = match device {
+        Device::GpuSoftware => GpuKind::Software,
+        _ => GpuKind::Hardware,
+    };
+    let gpu = Gpu::open(kind)?;
+    Ok(opened.insert(gpu).facts().clone())
+}

@@ -97,12 +97,7 @@ pub struct Sizes {
 
 impl Sizes {
     pub fn max(self, o: Sizes) -> Sizes {
-        Sizes {
-            source: self.source.max(o.source),
-            a: self.a.max(o.a),
-            b: self.b.max(o.b),
-            read: self.read.max(o.read),
-        }
+        Sizes { source: self.source.max(o.source), a: self.a.max(o.a), b: self.b.max(o.b), read: self.read.max(o.read) }
     }
 
     fn largest(self) -> u64 {
@@ -238,16 +233,8 @@ impl Job {
             square: matches!(quantity, Quantity::Sum { square: true, .. }) as u32,
             ..axis(0)
         };
-        let y = Pass {
-            in_axis: nx,
-            in_i: 1,
-            in_j: ny * nx,
-            out_axis: nx,
-            out_i: 1,
-            out_j: my * nx,
-            lines: nx,
-            ..axis(1)
-        };
+        let y =
+            Pass { in_axis: nx, in_i: 1, in_j: ny * nx, out_axis: nx, out_i: 1, out_j: my * nx, lines: nx, ..axis(1) };
         let x = Pass {
             in_axis: 1,
             in_i: nx,
@@ -288,7 +275,7 @@ mod tests {
             let parts = job.parts(cap).unwrap();
             assert_eq!(parts.len() == 1, cap == 1 << 30);
             let voxels: usize = parts.iter().map(|p| p.dst.iter().product::<usize>()).sum();
-            assert_eq!(voxels, job.dst.iter().product());
+            assert_eq!(voxels, job.dst.iter().product::<usize>());
             for p in &parts {
                 assert!(job.sizes(p).largest() <= cap);
                 for a in 0..3 {

@@ -3,6 +3,7 @@
 use super::graph::{Step, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
+use crate::gpu::{facts, passes};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, obscurance, rank, reduce, window};
 
@@ -81,6 +82,30 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     (kernel + copy + mask) as u64
 }
 
+/// Staging of the GPU lane for bricks of this shape, and its device buffers where they are this process's memory. Slots
+/// stay alive between bricks.
+fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
+    let Some(gpu) = &plan.gpu else { return 0 };
+    let cap = gpu.buffer_cap(plan.memory);
+    let mut sizes = passes::Sizes::default();
+    for &s in group.steps.iter().filter(|&&s| plan.on_gpu(s)) {
+        let step = &plan.graph.steps[s];
+        let StepKind::Window { params, channels } = &step.kind else { continue };
+        let dst = grown(group.brick.shape, step.halo, group.shape);
+        let src: Shape = std::array::from_fn(|a| {
+            let padded = dst[a] + 2 * step.reach[a];
+            if step.border == Border::Clip { padded.min(group.shape[a]) } else { padded }
+        });
+        let at = std::array::from_fn(|a| step.reach[a].min(src[a] - dst[a]));
+        let needs = window::Needs::of(channels.iter().copied(), false);
+        let dtype = plan.graph.wires[step.inputs[0]].dtype;
+        if let Some(job) = passes::Job::new(dtype, src, dst, at, params.radius, needs) {
+            sizes = sizes.max(job.slot(cap));
+        }
+    }
+    facts::SLOTS * sizes.host_bytes(gpu.software)
+}
+
 /// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.
 fn window_dtype(dtype: DType, border: Border) -> DType {
     match border {
@@ -109,9 +134,9 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
     written + encoded + cells + map
 }
 
-/// Open chunks of the levels between their first and last brick, for one task, all outputs.
+/// Open chunks of the levels between their first and last brick, for one task, all outputs; and the GPU lane's buffers.
 pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
-    let mut total = 0;
+    let mut total = gpu_bytes(plan, group);
     for &o in &group.outputs {
         let output = &plan.outputs[o];
         if !output.is_zarr() {
