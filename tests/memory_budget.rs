@@ -30,12 +30,21 @@ fn peak_of(mut child: std::process::Child) -> (u64, std::process::ExitStatus) {
 fn a_gibibyte_under_a_quarter_of_it() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("config.toml");
+    // Smooth and noisy by turns, 16 MiB repeated 64 times.
+    let block = fill([16, 1024, 1024], |z, y, x| {
+        let noise = hash(3, ((z * 1024 + y) * 1024 + x) as u64) % 16;
+        ((x / 8 + y / 5 + 4 * z) % 200) as u8 + noise as u8
+    });
+    let mut file = std::fs::File::create(dir.path().join("big.raw")).unwrap();
+    (0..64).for_each(|_| std::io::Write::write_all(&mut file, &block).unwrap());
+    drop(file);
     let text = r#"
 [run]
 memory = "256MiB"
 threads = 2
 [input.big]
-synthetic = "gyroid"
+path = "big.raw"
+format = "raw"
 shape = [1024, 1024, 1024]
 dtype = "u8"
 [stage.ao]
@@ -73,7 +82,9 @@ input = "big"
 radius = 5
 [output.mean]
 path = "mean.zarr"
-from = ["stats.mean", "stats.variance"]
+from = "stats.mean"
+dtype = "u8"
+range = [0, 255]
 "#;
     let path = dir.path().join("second.toml");
     std::fs::write(&path, second).unwrap();

@@ -58,6 +58,17 @@ macro_rules! per_type {
 }
 per_type!(U8, I8, U16, I16, U32, I32, F32, F64);
 
+macro_rules! from_vec {
+    ($($variant:ident: $t:ty),*) => {$(
+        impl From<Vec<$t>> for Voxels {
+            fn from(v: Vec<$t>) -> Voxels {
+                Voxels::$variant(v)
+            }
+        }
+    )*};
+}
+from_vec!(U8: u8, I8: i8, U16: u16, I16: i16, U32: u32, I32: i32, F32: f32, F64: f64);
+
 impl Voxels {
     /// Voxels held.
     pub fn len(&self) -> usize {

@@ -83,8 +83,11 @@ fn round_up(asked: Shape, align: Shape, task: Shape) -> Shape {
 fn candidates(group: &Group) -> Vec<Shape> {
     let shape = group.region.shape();
     let axis = |a: usize| {
-        let unit =
-            if group.chunk[a] % group.align[a] == 0 && group.chunk[a] > 1 { group.chunk[a] } else { group.align[a] };
+        let unit = if group.chunk[a].is_multiple_of(group.align[a]) && group.chunk[a] > 1 {
+            group.chunk[a]
+        } else {
+            group.align[a]
+        };
         let unit = if unit < 16 { unit * 16usize.div_ceil(unit) } else { unit };
         let mut edges: Vec<usize> = Vec::new();
         let mut edge = unit;
@@ -158,7 +161,7 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels; beyond, the pipeline only gets coarser.
     let large = 1.0 + (shape.iter().product::<usize>() as f64 / 16e6).powi(2) * 0.1;
     let partial_chunks =
-        if (0..3).any(|a| shape[a] % group.chunk[a] != 0 && shape[a] < region[a]) { 1.15 } else { 1.0 };
+        if (0..3).any(|a| !shape[a].is_multiple_of(group.chunk[a]) && shape[a] < region[a]) { 1.15 } else { 1.0 };
     let overhead = 1.0 + 20_000.0 / shape.iter().product::<usize>() as f64;
     choice.amplification.powf(0.8) * rounds * short_rows * starved * large * partial_chunks * overhead
 }

@@ -108,6 +108,8 @@ pub enum StepKind {
         weight: GradientWeight,
         spacing: [f64; 3],
         channels: Vec<GradientChannel>,
+        /// Of stored values (for normals, whose sign the sweep takes from its own parameters), not of scaled ones.
+        stored: bool,
     },
     Transfer {
         points: Vec<TransferPoint>,

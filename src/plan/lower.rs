@@ -191,6 +191,7 @@ impl Lowering<'_> {
             Op::Box { input, radius } => {
                 let src = self.wire(input, place)?;
                 let radius = lengths::radius(radius, self.lattice(src), &key("radius"))?;
+                self.check_window(src, radius, node.border, &key("radius"))?;
                 let channels = wanted.iter().map(|c| (*c, box_channel(c))).collect();
                 self.window(index, node, src, radius, false, channels)
             }
@@ -200,6 +201,7 @@ impl Lowering<'_> {
                 if *region == AoRegion::EqualVolume {
                     radius = lengths::equal_volume(radius);
                 }
+                self.check_window(src, radius, node.border, &key("radius"))?;
                 if *method == Method::Exact {
                     let shape = if *region == AoRegion::Ball { WindowShape::Ball } else { WindowShape::Box };
                     let params = self.window_params(src, radius, *solid_low);
@@ -278,6 +280,18 @@ impl Lowering<'_> {
         &self.out.graph.lattices[self.out.graph.wires[wire].lattice]
     }
 
+    /// Window kernels count voxels in 32 bits.
+    fn check_window(&self, src: WireId, radius: [usize; 3], border: Border, key: &str) -> Result<()> {
+        let shape = self.lattice(src).shape;
+        let cut = |side: f64, a: usize| if border == Border::Clip { side.min(shape[a] as f64) } else { side };
+        let voxels: f64 = (0..3).map(|a| cut(2.0 * radius[a] as f64 + 1.0, a)).product();
+        if voxels >= (1u64 << 31) as f64 {
+            let message = format!("{radius:?} voxels (z, y, x) make a window of {voxels:.0} voxels; at most 2^31 - 1");
+            return Err(Error::config(key, message));
+        }
+        Ok(())
+    }
+
     fn window_params(&self, src: WireId, radius: [usize; 3], solid_low: bool) -> WindowParams {
         let wire = &self.out.graph.wires[src];
         WindowParams { radius, affine: wire.affine, missing: wire.missing, solid_low }
@@ -331,7 +345,7 @@ impl Lowering<'_> {
         weight: GradientWeight,
         channels: Vec<GradientChannel>,
     ) -> StepKind {
-        StepKind::Gradient { size, weight, spacing: self.lattice(src).spacing, channels }
+        StepKind::Gradient { size, weight, spacing: self.lattice(src).spacing, channels, stored: false }
     }
 
     fn saliency(
@@ -410,7 +424,9 @@ impl Lowering<'_> {
 
     /// The 3^3 gradient (weight inverse) of the density, for `weight_by_normal`.
     fn normal(&mut self, index: usize, node: &StageNode, src: WireId) -> Result<WireId> {
-        let kind = self.gradient_kind(src, 3, GradientWeight::Inverse, vec![GradientChannel::Vector]);
+        let spacing = self.lattice(src).spacing;
+        let channels = vec![GradientChannel::Vector];
+        let kind = StepKind::Gradient { size: 3, weight: GradientWeight::Inverse, spacing, channels, stored: true };
         let step = self.new_step(node, kind, vec![src], [1; 3], Border::Nearest)?;
         let wire = self.output_wire(index, node, "vector", step, &[src]);
         self.out.graph.wires[wire].name = format!("{} (normal)", node.name);
@@ -431,6 +447,29 @@ impl Lowering<'_> {
         Ok(Some(Mask { wire, rule: rule.clone(), reach }))
     }
 
+    /// Stages that look at one field take one component; pointwise ones take as many on each side, or one.
+    fn check_components(&self, node: &StageNode, inputs: &[WireId]) -> Result<()> {
+        let count = |w: &WireId| self.out.graph.wires[*w].components;
+        let most = inputs.iter().map(count).max().unwrap_or(1);
+        let single = matches!(
+            node.op,
+            Op::Gradient { .. } | Op::Saliency { .. } | Op::Transfer { .. } | Op::OcclusionMap { .. }
+        );
+        let first = if matches!(node.op, Op::Obscurance(_)) { count(&inputs[0]) } else { 1 };
+        if (single && most > 1) || first > 1 {
+            let name = &self.out.graph.wires[inputs[0]].name;
+            let message = format!("\"{name}\" has {most} components; {} takes one (`channel = 0`)", node.op.word());
+            return Err(Error::config(format!("{}.input", node.place.key), message));
+        }
+        let mixed = !matches!(node.op, Op::Obscurance(_)) && inputs.iter().any(|w| count(w) != most && count(w) != 1);
+        if mixed {
+            let counts: Vec<usize> = inputs.iter().map(count).collect();
+            let message = format!("inputs of {counts:?} components; each must have as many as the others, or one");
+            return Err(Error::config(node.place.key.clone(), message));
+        }
+        Ok(())
+    }
+
     fn new_step(
         &mut self,
         node: &StageNode,
@@ -440,6 +479,7 @@ impl Lowering<'_> {
         border: Border,
     ) -> Result<StepId> {
         let mask = self.mask(node)?;
+        self.check_components(node, &inputs)?;
         let shapes = inputs.iter().chain(mask.as_ref().map(|m| &m.wire));
         let first = self.lattice(inputs[0]).shape;
         for &w in shapes {

@@ -151,7 +151,7 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
             // Along the Morton curve, at most the chunks along a brick's longest row wait at once, and about as many again.
             let chunk = output.spec.chunk.iter().map(|&n| n as u64).product::<u64>() * voxel * parts;
             let row = group.brick.shape[2].div_ceil(output.spec.chunk[2]) as u64;
-            let whole = k == 0 && (0..3).all(|a| group.brick.shape[a] % output.spec.chunk[a] == 0);
+            let whole = k == 0 && (0..3).all(|a| group.brick.shape[a].is_multiple_of(output.spec.chunk[a]));
             total += if whole { 0 } else { level.min(chunk * 8 * row.max(1)) };
         }
         // Cells kept for the second phase.

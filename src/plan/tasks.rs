@@ -125,7 +125,7 @@ impl OutputPlan {
             return false;
         };
         k <= self.brick_level()
-            && (0..3).all(|a| group.task[a] >= shape[a] || group.task[a] % (file[a] * level.factor[a]) == 0)
+            && (0..3).all(|a| group.task[a] >= shape[a] || group.task[a].is_multiple_of(file[a] * level.factor[a]))
     }
 
     /// The box of level `k` (in its own cells, counted from the output's start) that a box of voxels makes.

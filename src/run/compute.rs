@@ -87,9 +87,9 @@ pub fn evaluate(
                 value.recycle(engine.pool);
             }
         }
-        for w in 0..values.len() {
-            if values[w].is_some() && !program.wanted_after(plan, at, w) {
-                values[w].take().into_iter().for_each(|v| v.recycle(engine.pool));
+        for (w, value) in values.iter_mut().enumerate() {
+            if value.is_some() && !program.wanted_after(plan, at, w) {
+                value.take().into_iter().for_each(|v| v.recycle(engine.pool));
             }
         }
     }

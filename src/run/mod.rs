@@ -38,6 +38,7 @@ use crate::config::Config;
 pub fn run(config: &Config, options: &RunOptions, progress: &dyn Progress) -> Result<Report> {
     let session = Session::open(config, options, progress)?;
     let tasks = session.open_tasks();
+    tracing::info!(open = tasks.len(), of = session.task_count(), "tasks");
     session.run_tasks(&tasks)?;
     session.finish()
 }

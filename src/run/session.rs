@@ -30,6 +30,9 @@ use crate::store::sink::Sink;
 use crate::store::{Source, VolumeInfo, open_inputs};
 use crate::{Error, Result};
 
+/// Turns a finished brick into chunks.
+type Deliver<'d> = dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync + 'd;
+
 /// One run, opened.
 pub struct Session<'a> {
     config: &'a Config,
@@ -58,7 +61,20 @@ pub struct Session<'a> {
 impl<'a> Session<'a> {
     /// Plans, unpacks inputs where needed, runs the pre-passes, opens the outputs.
     pub fn open(config: &'a Config, options: &'a RunOptions, progress: &'a dyn Progress) -> Result<Session<'a>> {
-        let sources = open_inputs(config)?;
+        Session::open_with(config, open_inputs(config)?, options, progress)
+    }
+
+    /// As [`Session::open`], on sources of the caller's (arrays in memory, for instance): one per input of the config, in
+    /// its order.
+    pub fn open_with(
+        config: &'a Config,
+        sources: Vec<Source>,
+        options: &'a RunOptions,
+        progress: &'a dyn Progress,
+    ) -> Result<Session<'a>> {
+        if sources.len() != config.inputs.len() {
+            return Err(Error::Failed(format!("{} sources for {} inputs", sources.len(), config.inputs.len())));
+        }
         let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
         let (plan, gpu) = plan_and_gpu(config, &infos, options.resume)?;
         plan.warnings.iter().for_each(|w| progress.note(w));
@@ -153,6 +169,10 @@ impl<'a> Session<'a> {
                 self.progress.update(bytes, total, 0, 0, "unpack");
                 !cancel.is_cancelled()
             })?;
+        }
+        // What was unpacked has no name any more; nothing stays behind, whatever happens.
+        if let Some(dir) = self.scratch.take() {
+            let _ = std::fs::remove_dir(dir);
         }
         self.options.cancel.check()
     }
@@ -298,7 +318,7 @@ impl<'a> Session<'a> {
         brick: &BrickChoice,
         work: &[Work],
         metrics: &Metrics,
-        deliver: &(dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync),
+        deliver: &Deliver,
         write: &(dyn Fn(Work, Vec<Item>) -> Result<()> + Sync),
         tick: &(dyn Fn() + Sync),
     ) -> Result<()> {
@@ -382,11 +402,8 @@ impl<'a> Session<'a> {
             );
             let windows = windows::of_output(output);
             let Target { sink, levels, cells, .. } = target;
-            drop((levels, cells)); // their files go with the work folder
-            for k in 0..=output.level_count() {
-                let _ = std::fs::remove_file(dir.join(format!("level.{k}")));
-                let _ = std::fs::remove_file(dir.join(format!("cells.{k}")));
-            }
+            // Their files go with the work folder, after the output says that it is complete: a kill in between must find them.
+            drop((levels, cells));
             sink.finish(&attributes, &windows)?;
         }
         if let Some(journal) = self.journal.take() {

@@ -201,7 +201,7 @@ impl<'a> Engine<'a> {
                     &mut cx,
                 );
             }
-            StepKind::Gradient { size, weight, spacing, channels } => {
+            StepKind::Gradient { size, weight, spacing, channels, stored } => {
                 let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
                 let mut out = gradient::GradientOut::default();
                 for (channel, value) in channels.iter().zip(&mut outputs) {
@@ -211,7 +211,8 @@ impl<'a> Engine<'a> {
                         GradientChannel::Vector => out.vector = Some(three(views)),
                     }
                 }
-                let (affine, missing) = (src.affine, src.missing);
+                let affine = if *stored { Affine::IDENTITY } else { src.affine };
+                let missing = src.missing;
                 gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
                 src.recycle(self.pool);
             }

@@ -153,6 +153,7 @@ impl<W: Send> Stream<'_, W> {
             return;
         }
         let worker = rayon::current_thread_index().unwrap_or(0);
+        let _span = tracing::debug_span!("brick", region = ?work.brick, worker).entered();
         let mut scratch = scratches[worker].lock().unwrap_or_else(|e| e.into_inner());
         let result = guarded(|| {
             let engine = self.reader.engine;

@@ -1,5 +1,7 @@
 //! Sets of sweep directions and the areas of their cells on the sphere (SPEC section 4, obscurance).
 
+use glam::DVec3;
+
 use crate::stage::{DirectionSet, DirectionWeights};
 
 /// Physical unit vectors, `[z, y, x]`. An icosahedral set has 12, 42 or 162 (see [`icosahedron_level`]; another count
@@ -38,11 +40,11 @@ fn unit(v: [f64; 3]) -> [f64; 3] {
 }
 
 fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    DVec3::from(a).dot(b.into())
 }
 
 fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    DVec3::from(a).cross(b.into()).into()
 }
 
 /// Vertices of the icosahedron after `level` subdivisions, each of which adds the normalised midpoints of all edges.

@@ -337,47 +337,46 @@ def formats(folder):
     import zarr
 
     v = RNG.integers(-1000, 1000, (9, 10, 11)).astype("<i2")
-    plain = lambda source, **keys: (run(folder, f"[input.a]\n{source}\n[output.o]\npath = 'o.npy'\nfrom = 'a'\n"), np.load(folder / "o.npy"))[1]
     image = nibabel.Nifti1Image(v.T, np.diag([0.5, 0.75, 2, 1]))
     image.header.set_xyzt_units("mm")
     for name in ["a.nii", "a.nii.gz"]:
         nibabel.save(image, folder / name)
-        close(name, plain(f"path = '{name}'"), v, 0)
+        close(name, plain(folder, f"path = '{name}'"), v, 0)
     scaled = nibabel.Nifti1Image(v.T, np.eye(4))
     scaled.header.set_slope_inter(0.5, 10)
     nibabel.save(scaled, folder / "s.nii")
     raw = np.asanyarray(nibabel.load(folder / "s.nii").dataobj)
-    close("NIfTI slope", plain("path = 's.nii'"), raw.T, 1e-3)
+    close("NIfTI slope", plain(folder, "path = 's.nii'"), raw.T, 1e-3)
     for encoding in ["raw", "gzip"]:
         nrrd.write(str(folder / "a.nrrd"), v.T, {"encoding": encoding, "spacings": [0.5, 0.75, 2]})
-        close(f"NRRD {encoding}", plain("path = 'a.nrrd'"), v, 0)
+        close(f"NRRD {encoding}", plain(folder, "path = 'a.nrrd'"), v, 0)
     nrrd.write(str(folder / "a.nhdr"), v.T, {"encoding": "raw"})
-    close("NHDR", plain("path = 'a.nhdr'"), v, 0)
+    close("NHDR", plain(folder, "path = 'a.nhdr'"), v, 0)
     for name, compress in [("a.mha", False), ("b.mha", True), ("c.mhd", False), ("d.mhd", True)]:
         itk = SimpleITK.GetImageFromArray(v)
         itk.SetSpacing((0.5, 0.75, 2))
         SimpleITK.WriteImage(itk, str(folder / name), compress)
-        close(name, plain(f"path = '{name}'"), v, 0)
+        close(name, plain(folder, f"path = '{name}'"), v, 0)
     u = (v + 1000).astype("u2")
     for name, keys in [("a.tif", {}), ("b.tif", {"compression": "zlib"}), ("c.tif", {"bigtiff": True}), ("d.tif", {"byteorder": ">"}),
                        ("e.tif", {"tile": (16, 16)}), ("f.tif", {"imagej": True, "metadata": {"axes": "ZYX", "spacing": 2.0, "unit": "um"}})]:
         tifffile.imwrite(folder / name, u, photometric="minisblack", **keys)
-        close(f"TIFF {name}", plain(f"path = '{name}'"), u, 0)
+        close(f"TIFF {name}", plain(folder, f"path = '{name}'"), u, 0)
     (folder / "slices").mkdir()
     for z in range(9):
         tifffile.imwrite(folder / "slices" / f"s{z + 5}.tif", u[z])
-    close("TIFF folder", plain("path = 'slices'"), u, 0)
+    close("TIFF folder", plain(folder, "path = 'slices'"), u, 0)
     for version in (2, 3):
         z = zarr.create_array(store=str(folder / f"z{version}"), shape=v.shape, chunks=(4, 4, 4), dtype="i2", zarr_format=version, fill_value=7)
         z[:5] = v[:5]
         want = np.full(v.shape, 7)
         want[:5] = v[:5]
-        close(f"Zarr v{version}", plain(f"path = 'z{version}'"), want, 0)
+        close(f"Zarr v{version}", plain(folder, f"path = 'z{version}'"), want, 0)
     z = zarr.create_array(store=str(folder / "zs"), shape=v.shape, chunks=(4, 4, 4), shards=(8, 8, 8), dtype="i2", zarr_format=3)
     z[:] = v
-    close("Zarr sharded", plain("path = 'zs'"), v, 0)
+    close("Zarr sharded", plain(folder, "path = 'zs'"), v, 0)
     (folder / "a.raw").write_bytes(b"head" + v.astype(">i2").tobytes())
-    close("raw", plain("path = 'a.raw'\nformat = 'raw'\nshape = [9, 10, 11]\ndtype = 'i16'\nendian = 'big'\noffset = 4"), v, 0)
+    close("raw", plain(folder, "path = 'a.raw'\nformat = 'raw'\nshape = [9, 10, 11]\ndtype = 'i16'\nendian = 'big'\noffset = 4"), v, 0)
     np.save(folder / "a.npy", v)
     outputs = {"n": "o.nrrd", "i": "o.nii", "r": "o.raw"}
     run(folder, "[input.a]\npath = 'a.nii'\n" + "".join(f"[output.{k}]\npath = '{p}'\nfrom = 'a'\n" for k, p in outputs.items()))
@@ -519,8 +518,315 @@ shard = 8
                 close(f"occlusion map {start} level {k} scale", scale[-3:], [2.0**k] * 3, 0)
 
 
+def scaling(folder):
+    """Slope, intercept, nodata, physical radii, thresholds in scaled units."""
+    v = RNG.integers(-100, 100, (9, 8, 12)).astype("<i2")
+    v[RNG.random(v.shape) < 0.1] = -1000
+    np.save(folder / "a.npy", v)
+    d = v.astype(float)
+    d[v == -1000] = np.nan
+    for slope, intercept in [(2.0, -5.0), (-0.5, 3.0)]:
+        source = f"path = 'a.npy'\nslope = {slope}\nintercept = {intercept}\nnodata = -1000\nspacing = [2.0, 1.0, 1.0]\nunit = 'mm'"
+        w = slope * d + intercept
+        r = (1, 2, 2)
+        box = "op = 'box'\nradius = '2.1 mm'"
+        for channel, f in {"mean": np.mean, "min": np.min, "max": np.max, "variance": np.var, "std": np.std, "moment2": lambda x: np.mean(x * x)}.items():
+            want = over(w, r, lambda c, x: f(x))
+            got = stage(folder, source, box, f"s.{channel}")
+            assert got.dtype == np.float32, (channel, got.dtype)
+            close(f"slope {slope} {channel}", got, want, 1e-5 * np.nanmax(np.abs(want)))
+        for method in ["exact", "cdf_power", "gaussian_cdf", "chebyshev"]:
+            body = f"op = 'ambient_occlusion'\nmethod = '{method}'\nradius = '2.1 mm'"
+            close(f"slope {slope} {method}", stage(folder, source, body), over(w, r, openness(method, False)), 1e-5)
+        close(f"slope {slope} input", plain(folder, source), w, 1e-4)
+    # Without scaling, min and max keep the type; missing voxels hold the fill.
+    got = stage(folder, "path = 'a.npy'\nnodata = -1000", "op = 'box'\nradius = 1\nfill = 0", "s.max")
+    assert got.dtype == np.int16, got.dtype
+    want = over(d, 1, lambda c, x: x.max())
+    close("max keeps the type", got[v != -1000], want[v != -1000], 0)
+    u8 = stage(folder, "path = 'a.npy'\nnodata = -1000", "op = 'ambient_occlusion'\nmethod = 'exact'\nradius = 1\nfill = 0.2", dtype="u8")
+    codes = over(d, 1, openness("exact", False)) * 255
+    codes[np.isnan(codes)] = 51
+    # O is rounded to f32 before it is scaled, so an exact half may fall either way.
+    sure = np.abs(codes % 1 - 0.5) > 1e-4
+    close("u8 openness with fill", u8[sure], np.round(codes)[sure], 0)
+
+
+def plain(folder, source):
+    run(folder, f"[input.a]\n{source}\n[output.o]\npath = 'o.npy'\nfrom = 'a'\n")
+    return np.load(folder / "o.npy")
+
+
+def infinities(folder):
+    v = RNG.normal(size=(8, 8, 20)).astype("<f4")
+    v[4, 4, 3], v[3, 3, 14] = np.inf, -np.inf
+    np.save(folder / "a.npy", v)
+    d = v.astype(float)
+    near = np.zeros(v.shape, bool)
+    for z, y, x in [(4, 4, 3), (3, 3, 14)]:
+        near[z - 2 : z + 3, y - 2 : y + 3, x - 2 : x + 3] = True
+    with np.errstate(all="ignore"):
+        mean = over(d, 2, lambda c, w: w.mean())
+    got = stage(folder, "path = 'a.npy'", "op = 'box'\nradius = 2")
+    close("mean with infinities", np.nan_to_num(got, posinf=1e9, neginf=-1e9), np.nan_to_num(mean, posinf=1e9, neginf=-1e9), 1e-5)
+    got = stage(folder, "path = 'a.npy'", "op = 'box'\nradius = 2", "s.variance")
+    assert np.isnan(got[near]).all() and not np.isnan(got[~near]).any()
+    for method in ["exact", "cdf_power", "gaussian_cdf", "chebyshev"]:
+        got = stage(folder, "path = 'a.npy'", f"op = 'ambient_occlusion'\nmethod = '{method}'\nradius = 2")
+        assert got[4, 4, 3] == 1 and got[3, 3, 14] == 0, method
+        far = np.where(near, 0.0, d)
+        want = over(d, 2, lambda c, w: openness(method, False)(c, w) if np.isfinite(w).all() else 0.0)
+        close(f"{method} away from infinities", got[~near], want[~near], 1e-5)
+        assert far is not None and not np.isnan(got[near & np.isfinite(d)]).any(), method
+
+
+def pointwise(folder):
+    v = RNG.random((10, 9, 11)).astype("<f4") * 100
+    np.save(folder / "a.npy", v)
+    d = v.astype(float)
+    points = [[10, 0.0, 1, 0, 0], [40, 0.5, 0, 1, 0], [80, 1.0, 0.2, 0.4, 0.8]]
+    body = f"op = 'transfer'\npoints = {points}"
+    xs = [p[0] for p in points]
+    close("transfer opacity", stage(folder, "path = 'a.npy'", body), np.interp(d, xs, [p[1] for p in points]), 1e-6)
+    rgb = np.array([np.interp(d, xs, [p[c] for p in points]) for c in (2, 3, 4)])
+    close("transfer rgb", stage(folder, "path = 'a.npy'", body, "s.rgb"), rgb, 1e-6)
+    o = over(d, 2, openness("cdf_power", False))
+    var = over(d, 1, lambda c, w: w.var())
+    run(folder, f"""
+[run]
+brick = 8
+[input.a]
+path = 'a.npy'
+spacing = [1, 1, 2]
+[stage.ao]
+op = 'ambient_occlusion'
+input = 'a'
+method = 'cdf_power'
+radius = 2
+[stage.st]
+op = 'box'
+input = 'a'
+radius = 1
+[stage.t]
+op = 'transfer'
+input = 'a'
+points = {points}
+[stage.keep]
+op = 'window'
+input = 'ao'
+low = 0.3
+high = 0.7
+[stage.stretch]
+op = 'window'
+input = 'ao'
+low = 0.3
+high = 0.7
+mode = 'stretch'
+[stage.mod]
+op = 'opacity_modulation'
+input = 't.opacity'
+by = 'st.variance'
+sigma_max2 = 900
+[stage.sal]
+op = 'saliency'
+input = 'ao'
+[stage.max]
+op = 'saliency'
+input = 'ao'
+scale = 'max'
+[stage.smod]
+op = 'opacity_modulation'
+input = 't.opacity'
+by = 'max'
+threshold = 0.2
+gain = 2
+[stage.light]
+op = 'ambient_light'
+input = 'ao'
+rgb = 't.rgb'
+k = 0.8
+[stage.sum]
+op = 'combine'
+inputs = ['ao', 't.opacity', 'keep']
+op_kind = 'add'
+""" + "".join(f"[output.{k}]\npath = '{k}.npy'\nfrom = '{k}'\ndtype = 'f32'\n" for k in "keep stretch mod sal max smod light sum".split()))
+    get = lambda k: np.load(folder / f"{k}.npy").astype(float)
+    keep = np.where(o < 0.3, 0, np.where(o > 0.7, 1, o))
+    edge = np.minimum(np.abs(o - 0.3), np.abs(o - 0.7)) > 1e-5
+    close("window keep", get("keep")[edge], keep[edge], 1e-5)
+    close("window stretch", get("stretch"), np.clip((o - 0.3) / 0.4, 0, 1), 1e-4)
+    opacity = np.interp(d, xs, [p[1] for p in points])
+    close("modulation by variance", get("mod"), opacity * np.minimum(var / 900, 1), 1e-5)
+    close("ambient light", get("light"), 0.8 * o * rgb, 1e-5)
+    close("combine", get("sum")[edge], (o + opacity + keep)[edge], 3e-5)
+    pad = np.pad(o, 2, mode="edge")
+    grad = []
+    for a in range(3):
+        num, den = np.zeros(o.shape), 0.0
+        for i in np.ndindex(5, 5, 5):
+            p = (np.array(i) - 2) * np.array([1, 1, 2.0])
+            w = np.linalg.norm(p)
+            num += w * p[a] * pad[i[0] : i[0] + o.shape[0], i[1] : i[1] + o.shape[1], i[2] : i[2] + o.shape[2]]
+            den += w * p[a] ** 2
+        grad.append(num / den)
+    sal = np.sqrt(sum(g * g for g in grad))
+    close("saliency", get("sal"), sal, 1e-5)
+    close("saliency over its maximum", get("max"), sal / sal.max(), 1e-4)
+    s = sal / sal.max()
+    safe = np.abs(s - 0.2) > 1e-4
+    close("modulation by saliency", get("smod")[safe], np.clip(np.where(s < 0.2, 0, opacity * s * 2), 0, 1)[safe], 1e-4)
+
+
+def wheres(folder):
+    """Masks, fills, and what they do to levels."""
+    import zarr
+
+    v = RNG.normal(size=(20, 18, 22)).astype("<f4")
+    v = sum(np.roll(v, k, a) for k in (-1, 0, 1) for a in range(3)).astype("<f4")
+    np.save(folder / "a.npy", v)
+    d = v.astype(float)
+    want = over(d, 1, openness("gaussian_cdf", False))
+    for flags in ([], ["--no-skip"]):
+        run(folder, """
+[run]
+brick = 8
+[input.a]
+path = 'a.npy'
+[stage.s]
+op = 'ambient_occlusion'
+input = 'a'
+method = 'gaussian_cdf'
+radius = 1
+fill = 0.25
+where = { input = 'a', min = 0.5, max = 2.5 }
+[output.o]
+path = 'o.zarr'
+from = 's'
+dtype = 'f32'
+chunk = 8
+shard = 16
+""", *flags)
+        need = (d >= 0.5) & (d <= 2.5)
+        group = zarr.open_group(str(folder / "o.zarr"), mode="r")
+        full = np.where(need, want, 0.25)
+        close(f"where range {flags}", group["0"][:], full, 1e-5)
+        one = group["1"][:]
+        expect = np.empty(one.shape)
+        for i in np.ndindex(*one.shape):
+            cell = tuple(slice(2 * k, 2 * k + 2) for k in i)
+            expect[i] = want[cell][need[cell]].mean() if need[cell].any() else 0.25
+        close(f"where level 1 {flags}", one, expect, 1e-5)
+    spacing = np.array([2.0, 1.0, 1.0])
+    iso, band = 1.0, 1.5
+    crossings = []
+    for a in range(3):
+        lo = np.moveaxis(d, a, 0)
+        for i in range(d.shape[a] - 1):
+            f, g = lo[i], lo[i + 1]
+            for y, x in np.argwhere(((f < iso) & (iso <= g)) | ((g < iso) & (iso <= f))):
+                t = (iso - f[y, x]) / (g[y, x] - f[y, x])
+                p = [y, x]
+                p.insert(a, i + t)
+                crossings.append(np.array(p) * spacing)
+    crossings = np.array(crossings)
+    need = np.empty(d.shape, bool)
+    sure = np.empty(d.shape, bool)
+    for i in np.ndindex(d.shape):
+        dist = np.sqrt(((crossings - np.array(i) * spacing) ** 2).sum(1)).min()
+        need[i], sure[i] = dist <= band, abs(dist - band) > 1e-5
+    got = stage(folder, "path = 'a.npy'\nspacing = [2.0, 1.0, 1.0]",
+                f"op = 'box'\nradius = 1\nfill = -9\nwhere = {{ input = 'a', iso = [{iso}], band = {band} }}")
+    mean = over(d, 1, lambda c, w: w.mean())
+    close("where iso", got[sure], np.where(need, mean, -9)[sure], 1e-5)
+
+
+def ranges(folder):
+    """Integer outputs by range, lists of channels, regions, placement."""
+    import zarr
+
+    v = RNG.random((14, 15, 16)).astype("<f4") * 10 - 3
+    np.save(folder / "a.npy", v)
+    d = v.astype(float)
+    mean = over(d, 1, lambda c, w: w.mean())
+    for dtype, top in [("u8", 255), ("u16", 65535)]:
+        got = stage(folder, "path = 'a.npy'", "op = 'box'\nradius = 1", dtype=dtype, range=[0, 3])
+        close(f"range {dtype}", got, np.round(np.clip((mean.astype("f4").astype(float)) / 3, 0, 1) * top), 1 if dtype == "u16" else 1)
+        got = stage(folder, "path = 'a.npy'", "op = 'box'\nradius = 1", dtype=dtype, range="auto")
+        lo, hi = mean.min(), mean.max()
+        close(f"range auto {dtype}", got, np.round((mean - lo) / (hi - lo) * top), 1)
+    run(folder, """
+[run]
+region = [[2, 11], [0, 15], [5, 16]]
+[input.a]
+path = 'a.npy'
+spacing = [0.5, 0.25, 0.25]
+unit = 'mm'
+origin = [1, 2, 3]
+[stage.s]
+op = 'box'
+input = 'a'
+radius = 1
+[output.o]
+path = 'o.zarr'
+from = ['s.mean', 's.max']
+chunk = 4
+shard = 8
+""")
+    group = zarr.open_group(str(folder / "o.zarr"), mode="r")
+    a = group["0"][:]
+    high = over(d, 1, lambda c, w: w.max())
+    close("region, list", a, np.array([mean, high])[:, 2:11, 0:15, 5:16], 1e-5)
+    image = dict(group.attrs)["ome"]["multiscales"][0]
+    assert [x["name"] for x in image["axes"]] == ["c", "z", "y", "x"] and image["axes"][1]["unit"] == "millimeter"
+    scale, move = image["datasets"][0]["coordinateTransformations"]
+    close("region scale", scale["scale"], [1, 0.5, 0.25, 0.25], 0)
+    close("region translation", move["translation"], [0, 2.0, 2.0, 4.25], 1e-12)
+    assert "omero" in dict(group.attrs)["ome"]
+
+
+def commands(folder):
+    """Exit codes and JSON of the commands."""
+    v = RNG.integers(0, 255, (16, 16, 16)).astype("u1")
+    np.save(folder / "a.npy", v)
+    text = "[input.a]\npath = 'a.npy'\n[stage.s]\nop = 'box'\ninput = 'a'\nradius = 2\n[output.o]\npath = 'o.zarr'\nfrom = 's'\n"
+    (folder / "c.toml").write_text(text)
+    call = lambda *args: subprocess.run([PROGRAM, *map(str, args)], capture_output=True, text=True, cwd=folder)
+    plan = call("plan", "c.toml", "--json")
+    assert plan.returncode == 0 and json.loads(plan.stdout)["peak_memory_bytes"] > 0
+    done = call("run", "c.toml", "--report", "r.json")
+    assert done.returncode == 0 and done.stdout == "", done
+    report = json.loads((folder / "r.json").read_text())
+    for key in "seconds voxels voxels_per_second bricks bytes_read bytes_written read_amplification memory_budget_bytes peak_memory_bytes stages waits placement".split():
+        assert key in report, key
+    assert call("run", "c.toml").returncode == 2
+    assert call("run", "c.toml", "--resume").returncode == 0
+    assert call("run", "c.toml", "--overwrite", "--set", "stage.s.radius=1").returncode == 0
+    assert call("run", "c.toml", "--resume").returncode == 2
+    assert call("run", "missing.toml").returncode == 2
+    assert call("run", "c.toml", "--overwrite", "--set", "input.a.path=none.npy").returncode == 1
+    bad = call("run", "c.toml", "--overwrite", "--set", "stage.s.radious=1")
+    assert bad.returncode == 2 and "radius" in bad.stderr and "panicked" not in bad.stderr, bad.stderr
+    assert call("run", "c.toml", "--device", "gpu", "--overwrite").returncode in (0, 1)
+    assert call("frobnicate").returncode == 2
+    info = json.loads(call("info", "o.zarr", "--json", "--stats").stdout)
+    assert info["shape"] == [16, 16, 16], info
+    same = call("compare", "a.npy", "a.npy", "--json")
+    assert same.returncode == 0 and json.loads(same.stdout)["rmse"] == 0, same
+    assert call("compare", "a.npy", "o.zarr", "--max-rmse", "0.001").returncode == 1
+    assert call("preview", "o.zarr", "p.png").returncode == 0 and (folder / "p.png").read_bytes()[:4] == b"\x89PNG"
+    schema = call("schema")
+    assert json.loads(schema.stdout)["type"] == "object"
+    assert "occlude" in call("completions", "bash").stdout
+    (folder / "junk.zarr").mkdir()
+    (folder / "junk.zarr" / "mine.txt").write_text("precious")
+    foreign = call("run", "c.toml", "--overwrite", "--set", "output.o.path=junk.zarr")
+    assert foreign.returncode == 2 and (folder / "junk.zarr" / "mine.txt").exists()
+    global CHECKS
+    CHECKS += 20
+
+
 def main():
-    parts = [methods, borders, gaussians, gradients, obscurances, formats, pyramids, maps]
+    parts = [methods, borders, gaussians, gradients, obscurances, formats, pyramids, maps, scaling, infinities, pointwise, wheres, ranges, commands]
     chosen = sys.argv[2:]
     for part in parts:
         if chosen and part.__name__ not in chosen:

@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 use super::VolumeInfo;
 use crate::brick::Voxels;
 use crate::config::{Input, InputKind};
-use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, ViewMut};
+use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, ViewMut, Voxel};
 use crate::kernel::simd::Level;
 use crate::{Error, Result};
 use detect::Format;
@@ -81,6 +81,15 @@ impl Source {
         let big = cfg!(target_endian = "big");
         let lattice = Lattice::dense(shape, voxels.dtype(), big, 0).expect("the voxels fit in memory");
         Source { info, kind: Kind::Planar(Planar::memory(lattice, voxels)), level: Level::detect() }
+    }
+
+    /// A volume in memory, copied from an array of axes z, y, x in any memory order. Panics if it is empty.
+    pub fn from_ndarray<T: Voxel>(array: ndarray::ArrayView3<T>) -> Source
+    where
+        Voxels: From<Vec<T>>,
+    {
+        let (z, y, x) = array.dim();
+        Source::from_array([z, y, x], array.iter().copied().collect::<Vec<T>>().into())
     }
 
     /// As [`Source::from_array`], with facts of the caller's; `info` keeps the array's shape and type.

@@ -1,32 +1,20 @@
 //! Unit names as files spell them, to UDUNITS names.
 
+use crate::config::units::udunits_name;
+
 /// UDUNITS name of a length unit as files spell it (`mm`, `µm`, `micron`, ...). `None` for an empty name and for
 /// "units" that carry no length (`pixel`, `voxel`, `none`); a name that is not known here is kept in lower case.
 pub fn normalise(text: &str) -> Option<String> {
     let plain = text.trim().trim_matches('\0').trim_matches('"').trim();
-    let plain = plain.replace("\\u00B5", "µ").replace("\\u00b5", "µ").replace('\u{3bc}', "µ");
-    // Case carries meaning in `Mm`/`mm` only, which no volume file uses.
     let low = plain.to_lowercase();
-    let name = match low.as_str() {
-        "" | "pixel" | "pixels" | "voxel" | "voxels" | "px" | "none" | "unknown" | "?" | "arbitrary" | "a.u." => {
-            return None;
-        }
-        "mm" | "millimeter" | "millimeters" | "millimetre" | "millimetres" => "millimeter",
-        "um" | "µm" | "micron" | "microns" | "micrometer" | "micrometers" | "micrometre" | "micrometres" => {
-            "micrometer"
-        }
-        "nm" | "nanometer" | "nanometers" | "nanometre" | "nanometres" => "nanometer",
-        "pm" | "picometer" | "picometre" => "picometer",
-        "cm" | "centimeter" | "centimeters" | "centimetre" | "centimetres" => "centimeter",
-        "dm" | "decimeter" | "decimetre" => "decimeter",
-        "m" | "meter" | "meters" | "metre" | "metres" => "meter",
-        "km" | "kilometer" | "kilometers" | "kilometre" | "kilometres" => "kilometer",
-        "a" | "å" | "\u{212b}" | "angstrom" | "angstroms" | "ångström" | "ångstrom" => "angstrom",
-        "in" | "inch" | "inches" => "inch",
-        "ft" | "foot" | "feet" => "foot",
-        other => other,
-    };
-    Some(name.to_string())
+    let lengthless = ["", "pixel", "pixels", "voxel", "voxels", "px", "none", "unknown", "?", "arbitrary", "a.u."];
+    if lengthless.contains(&low.as_str()) {
+        return None;
+    }
+    // Files shout (`MM`, `UM`) where no volume means megametres.
+    let known = udunits_name(plain).filter(|_| plain != "Mm").or_else(|| udunits_name(&low));
+    let escaped = || udunits_name(&plain.replace("\\u00b5", "\u{b5}").replace("\\u00B5", "\u{b5}"));
+    Some(known.or_else(escaped).map_or(low, str::to_string))
 }
 
 #[cfg(test)]

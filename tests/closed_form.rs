@@ -1,0 +1,88 @@
+//! Whole runs against mathematics, on arrays in memory.
+
+mod common;
+
+use common::*;
+use ndarray::Array3;
+use occlude::run::{RunOptions, Session, Silent};
+use occlude::store::Source;
+
+/// Runs one stage over an array and returns its main channel.
+fn stage(volume: &Array3<f32>, body: &str) -> Array3<f64> {
+    let dir = tempfile::tempdir().unwrap();
+    let text = format!(
+        "[run]\nbrick = 16\n[input.a]\npath = 'memory.npy'\n[stage.s]\ninput = 'a'\n{body}\n[output.o]\npath = 'o.npy'\nfrom = 's'\n\
+         dtype = 'f32'\n"
+    );
+    let config = parse(dir.path(), &text, &[]);
+    let options = RunOptions::default();
+    let source = Source::from_ndarray(volume.view());
+    let session = Session::open_with(&config, vec![source], &options, &Silent).unwrap_or_else(|e| panic!("{e}"));
+    let tasks = session.open_tasks();
+    session.run_tasks(&tasks).unwrap();
+    session.finish().unwrap();
+    let decoded = decode(&dir.path().join("o.npy"));
+    let (shape, bits) = &decoded["level 0 component 0"];
+    Array3::from_shape_fn((shape[0], shape[1], shape[2]), |(z, y, x)| {
+        f64::from_bits(bits[(z * shape[1] + y) * shape[2] + x])
+    })
+}
+
+#[test]
+fn a_plane_through_the_centre_leaves_half_open_by_mid_rank() {
+    // Values fall along z: half of each interior window is denser.
+    let v = Array3::from_shape_fn((31, 24, 26), |(z, _, _)| -(z as f32));
+    let o = stage(&v, "op = 'ambient_occlusion'\nmethod = 'exact'\nradius = 3\nties = 'mid'");
+    for z in 3..28 {
+        assert!((o[[z, 10, 10]] - 0.5).abs() < 1e-7, "{}", o[[z, 10, 10]]);
+    }
+}
+
+#[test]
+fn a_two_value_window_gives_chebyshev_its_exact_share() {
+    // Checkerboard of columns: the share of the high value in a window is known by counting.
+    let v = Array3::from_shape_fn((20, 20, 20), |(_, _, x)| if x < 10 { 0.0 } else { 4.0 });
+    let o = stage(&v, "op = 'ambient_occlusion'\nmethod = 'chebyshev'\nradius = 2");
+    // At x = 10 and 11 the window holds 3 and 4 of 5 planes of the high value: openness = 1 - share.
+    assert!((o[[10, 10, 10]] - 0.4).abs() < 1e-6 && (o[[10, 10, 11]] - 0.2).abs() < 1e-6);
+}
+
+#[test]
+fn a_uniform_field_gives_itself_by_the_power_law() {
+    let noise = |i: u64| (hash(11, i) >> 40) as f32 / (1u64 << 24) as f32;
+    let v = Array3::from_shape_fn((40, 40, 40), |(z, y, x)| noise(((z * 40 + y) * 40 + x) as u64));
+    let o = stage(&v, "op = 'ambient_occlusion'\nmethod = 'cdf_power'\nradius = 8");
+    let mut worst = 0.0f64;
+    for i in (8..32).step_by(5) {
+        worst = worst.max((o[[i, i, i]] - f64::from(v[[i, i, i]])).abs());
+    }
+    assert!(worst < 0.03, "t^beta of uniform values is the value: off by {worst}");
+}
+
+#[test]
+fn a_wall_dims_by_the_closed_form_of_each_rho() {
+    // One dense plane h voxels above; directions that meet it within dmax contribute rho. Lattice lines round by half a
+    // voxel, so the distances are long.
+    let (h, dmax) = (16usize, 40.0f64);
+    let v = Array3::from_shape_fn((40, 86, 86), |(z, _, _)| if z == 20 + h { 1.0 } else { 0.0 });
+    let a = h as f64 / dmax;
+    for (rho, expected) in [
+        ("step", 1.0 - (1.0 - a) / 2.0),
+        ("linear", 1.0 - ((1.0 - a) + a * a.ln()) / 2.0),
+        ("sqrt", 1.0 - (1.0 - a.sqrt()).powi(2) / 2.0),
+    ] {
+        let body =
+            format!("op = 'obscurance'\nset = 'fibonacci'\ndirections = 400\nrho = '{rho}'\nmax_distance = {dmax}");
+        let o = stage(&v, &body)[[20, 43, 43]];
+        assert!((o - expected).abs() < 0.012, "{rho}: {o}, closed form {expected}");
+    }
+}
+
+#[test]
+fn a_linear_ramp_has_its_slope_everywhere_inside() {
+    let v = Array3::from_shape_fn((14, 15, 16), |(z, y, x)| 2.0 * z as f32 - 3.0 * y as f32 + 6.0 * x as f32);
+    let g = stage(&v, "op = 'gradient'");
+    assert!((g[[7, 7, 7]] - 7.0).abs() < 1e-5, "{}", g[[7, 7, 7]]);
+    let flat = stage(&v, "op = 'gaussian'\nsigma = 1.0");
+    assert!((flat[[7, 7, 7]] - f64::from(v[[7, 7, 7]])).abs() < 1e-4);
+}
