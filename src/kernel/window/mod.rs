@@ -14,6 +14,7 @@ mod beta;
 mod columns;
 mod emit;
 mod estimate;
+pub mod finish;
 mod float;
 mod float_estimate;
 mod int;
@@ -29,7 +30,8 @@ mod tests;
 
 use emit::Emit;
 use int::Dispatch;
-use plan::{Job, Needs, Plain};
+pub use plan::Needs;
+use plan::{Job, Plain};
 
 /// One requested result. Its element type must be: for `Min` and `Max` the input's type where the affine is the identity,
 /// else `src.dtype().result()`; for everything else `src.dtype().result()`. An `Openness` may also ask for `u8` where
