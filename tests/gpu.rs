@@ -52,6 +52,7 @@ fn fills(dtype: DType, shape: Shape) -> Vec<(&'static str, Voxels)> {
     let (lo, hi) = dtype.range();
     let len: usize = shape.iter().product();
     let noise = move |i: usize| lo + (hash(3, i as u64) % (hi - lo + 1.0) as u64) as f64;
+    #[allow(clippy::type_complexity)]
     let kinds: [(&'static str, Box<dyn Fn(usize) -> f64>); 6] = [
         ("noise", Box::new(noise)),
         ("extremes", Box::new(move |i| if hash(5, i as u64).is_multiple_of(3) { lo } else { hi })),
