@@ -11,8 +11,8 @@
 //! | [`kernel`] | voxels to voxels on the CPU; each fast kernel beside its reference |
 //! | [`store`] | boxes of voxels from and to files |
 //! | [`config`] | TOML text to typed configuration |
-//! | [`plan`] | graph to plan: lattices, halos, fusing, bricks, tasks, peak bytes |
 //! | [`gpu`] | window kernels on a GPU, their facts for the planner |
+//! | [`plan`] | graph to plan: lattices, halos, fusing, bricks, tasks, peak bytes |
 //! | [`run`] | executes a plan: readers, workers, writers, byte budget, journal |
 //! | [`cli`] | commands, messages, reports |
 //!

@@ -44,6 +44,9 @@ fn all_channels() -> Vec<WindowChannel> {
     [Mean, Min, Max, Variance, Std, Moment2].into_iter().chain(open).collect()
 }
 
+/// A value for each index.
+type Fill = Box<dyn Fn(usize) -> f64>;
+
 /// Fills that break careless sums: noise, extremes of the type, constants, one voxel off, and a step.
 fn fills(dtype: DType, shape: Shape) -> Vec<(&'static str, Voxels)> {
     fn set<T: Voxel>(v: &mut [T], value: impl Fn(usize) -> f64) {
@@ -52,8 +55,7 @@ fn fills(dtype: DType, shape: Shape) -> Vec<(&'static str, Voxels)> {
     let (lo, hi) = dtype.range();
     let len: usize = shape.iter().product();
     let noise = move |i: usize| lo + (hash(3, i as u64) % (hi - lo + 1.0) as u64) as f64;
-    #[allow(clippy::type_complexity)]
-    let kinds: [(&'static str, Box<dyn Fn(usize) -> f64>); 6] = [
+    let kinds: [(&'static str, Fill); 6] = [
         ("noise", Box::new(noise)),
         ("extremes", Box::new(move |i| if hash(5, i as u64).is_multiple_of(3) { lo } else { hi })),
         ("greatest", Box::new(move |_| hi)),

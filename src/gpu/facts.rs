@@ -1,7 +1,6 @@
-//! What the planner knows about a GPU, and which steps have kernels there. No wgpu here.
+//! What the planner knows about a GPU, and which windows have kernels there. No wgpu here.
 
-use crate::grid::{Border, DType};
-use crate::plan::graph::{Step, StepKind, Wire};
+use crate::grid::DType;
 use crate::stage::{Method, WindowChannel};
 
 /// Which adapters may be opened.
@@ -23,6 +22,9 @@ pub struct GpuFacts {
     pub most_bytes: u64,
 }
 
+/// Why exact openness stays on the CPU.
+pub const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
+
 /// Bricks that are on the GPU at once: one computes while the host copies for the other.
 pub const SLOTS: u64 = 2;
 
@@ -32,23 +34,6 @@ impl GpuFacts {
     pub fn buffer_cap(&self, memory: u64) -> u64 {
         self.most_bytes.min((memory / 32).clamp(256 << 10, 256 << 20))
     }
-}
-
-const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
-
-/// Whether a step has a GPU kernel, or why not. `input` is the wire that the step reads.
-pub fn supports(step: &Step, input: &Wire) -> Result<(), &'static str> {
-    let channels = match &step.kind {
-        StepKind::Window { channels, .. } => channels,
-        StepKind::Rank { .. } => return Err(EXACT),
-        _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
-    };
-    if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {
-        return Err(
-            "the border's constant turns the voxels to floats, for which there is no GPU kernel: runs on the CPU",
-        );
-    }
-    window(input.dtype, input.missing.is_some(), channels)
 }
 
 /// Whether windows of this type have a GPU kernel, or why not.

@@ -11,7 +11,7 @@ pub mod passes;
 mod slot;
 
 pub use engine::{Gpu, GpuError, Times};
-pub use facts::{GpuFacts, GpuKind, supports};
+pub use facts::{GpuFacts, GpuKind};
 
 use crate::config::Device;
 

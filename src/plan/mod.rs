@@ -18,7 +18,8 @@ pub use outputs::{MapPlan, OutputPlan};
 pub use tasks::{Group, Task};
 
 use crate::config::{Config, Device};
-use crate::gpu::{self, GpuFacts};
+use crate::gpu::{GpuFacts, facts};
+use crate::grid::Border;
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 
@@ -137,9 +138,24 @@ const NO_GPU: &str = "no GPU: ";
 /// Stage, device and reason of every step.
 pub type Placement = Vec<(String, &'static str, String)>;
 
+/// Whether a step that reads `input` has a GPU kernel, or why not.
+fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static str> {
+    let channels = match &step.kind {
+        graph::StepKind::Window { channels, .. } => channels,
+        graph::StepKind::Rank { .. } => return Err(facts::EXACT),
+        _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
+    };
+    if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {
+        return Err(
+            "the border's constant makes floats of the voxels, for which there is no GPU kernel: runs on the CPU",
+        );
+    }
+    facts::window(input.dtype, input.missing.is_some(), channels)
+}
+
 /// Device of every step. An adapter is looked for where one is demanded, or where `auto` has a step for it.
 fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement, Option<GpuFacts>)> {
-    let supported = |s: &graph::Step| gpu::supports(s, &graph.wires[s.inputs[0]]);
+    let supported = |s: &graph::Step| gpu_kernel(s, &graph.wires[s.inputs[0]]);
     let any = graph.steps.iter().any(|s| supported(s).is_ok());
     let found = match config.run.device {
         Device::Cpu => None,
@@ -157,7 +173,7 @@ fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement
     let place = |s: &graph::Step| match (&found, supported(s)) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
-        (Some(Ok(facts)), Ok(())) => ("gpu", facts.name.clone()),
+        (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),
     };
