@@ -22,6 +22,8 @@ pub fn fits(w: usize) -> bool {
 
 /// Elements whose windows are summed.
 pub trait Columns<A>: Sized {
+    /// Whether [`Columns::sums`] does anything.
+    const COLUMNS: bool = false;
     /// Sums over windows of `w` lines for `outputs <= BLOCK` consecutive outputs and `cols` columns; output `k` goes to
     /// `out[at.0 + k * at.1..]`. Lines outside the clip count as zeros. Returns false, with nothing done, for types
     /// without this form.
@@ -46,6 +48,7 @@ impl Columns<Pair> for Pair {}
 macro_rules! columns {
     ($($t:ident)*) => {$(
         impl Columns<f64> for $t {
+            const COLUMNS: bool = true;
             fn sums(
                 level: Level,
                 src: &[$t],

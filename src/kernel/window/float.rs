@@ -8,7 +8,7 @@ use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, deep_len, rows_extremes};
 use super::lines::{self, Add, Coding, Elem, Lines, Masked, Op, Sources};
 use super::merge::{Moments, Sum, Wanted, gather, grow, tree_merge};
-use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
+use super::plan::{self, Job, Needs, Plain, Stage, Tile, cut, padded};
 use super::{Context, WindowOut};
 use crate::grid::{AnyViewMut, Shape, View};
 use crate::kernel::simd::Level;
@@ -49,7 +49,11 @@ pub fn bytes<T: Float>(job: &Job) -> usize {
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
     let rows =
         padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
-    Emit::bytes(job.tile[1]) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
+    Emit::bytes(job.tile[1])
+        + padded::<T>(Stage::len(job, size_of::<T>()))
+        + padded::<f64>(job.tile[1])
+        + k * (planes + rows)
+        + Buffers::<T::Total>::bytes(job)
 }
 
 /// Moments on their way through the three axes.
@@ -125,6 +129,7 @@ pub fn run<T: Float>(
     let deep = cut::<T>(bytes, k * deep_len(job));
     let out_lo = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
     let out_hi = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let stage = cut::<T>(bytes, Stage::len(job, size_of::<T>()));
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
     let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
@@ -136,10 +141,12 @@ pub fn run<T: Float>(
         hi.fill(T::LEAST);
         b.planes.clear();
         for z0 in (0..dst[0]).step_by(job.batch) {
-            if needs.extremes {
-                planes_extremes(level, job, &tile, src, z0, lo, hi, deep);
+            let fast = needs.mean && wanted == Wanted::SUMS && T::COLUMNS && columns::fits(job.window[0]);
+            if needs.extremes || fast {
+                let sums = if fast { &mut *b.planes.s } else { &mut [] };
+                planes_rows(level, job, &tile, src, z0, lo, hi, sums, deep, stage);
             }
-            if needs.mean {
+            if needs.mean && !fast {
                 planes_moments(level, wanted, job, &tile, src, z0, &mut b);
             }
             for z in z0..(z0 + job.batch).min(dst[0]) {
@@ -232,9 +239,10 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
     }
 }
 
-/// Extremes over z of a batch of output planes, straight from `src`. NaN never wins a comparison, so it does not count.
+/// Extremes over z of a batch of output planes, and sums where `sums` holds planes for them. NaN never wins a
+/// comparison, so it does not count.
 #[allow(clippy::too_many_arguments)]
-fn planes_extremes<T: Float>(
+fn planes_rows<T: Float>(
     level: Level,
     job: &Job,
     tile: &Tile,
@@ -242,34 +250,28 @@ fn planes_extremes<T: Float>(
     z0: usize,
     lo: &mut [T],
     hi: &mut [T],
+    sums: &mut [T::Total],
     work: &mut [T],
+    buffer: &mut [T],
 ) {
     let cols = tile.cols.1 - tile.cols.0;
     let plain = Coding { flip: T::default(), missing: T::default() };
+    let stage = Stage::new(job, size_of::<T>(), z0);
+    let w = job.window[0];
     for j in tile.rows.0..tile.rows.1 {
-        let lines = Lines {
-            base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
-            pitch: src.plane,
-            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
-            clip: (0, job.src[0] as isize),
-        };
+        let (from, lines) = stage.fill(tile, src, j, buffer);
         let out = (tile.span(job, j).start, job.plane());
-        let (w, from) = (job.window[0], [src.data; 2]);
-        blocked(
-            level,
-            (job.batch, job.block),
-            Masked::<false>,
-            Sources::<false>,
-            from,
-            lines,
-            w,
-            cols,
-            plain,
-            lo,
-            hi,
-            out,
-            work,
-        );
+        if !lo.is_empty() {
+            let (masked, sources, blocks) = (Masked::<false>, Sources::<false>, (job.batch, job.block));
+            blocked(level, blocks, masked, sources, [from; 2], lines, w, cols, plain, lo, hi, out, work);
+        }
+        for k in (0..job.batch).step_by(BLOCK) {
+            if !sums.is_empty() {
+                let lines = Lines { first: lines.first + k as isize, ..lines };
+                let at = (k * job.plane() + out.0, job.plane());
+                T::sums(level, from, lines, w, BLOCK.min(job.batch - k), cols, sums, at);
+            }
+        }
     }
 }
 
@@ -310,22 +312,6 @@ fn planes_moments<T: Float>(
     let (w, len) = (job.window[0], job.batch * width);
     let (levels, pitch) = (lines::tree_levels(w), len + w * width);
     let first = (job.at[0] + z0) as isize - job.radius[0] as isize;
-    if wanted == Wanted::SUMS && columns::fits(w) {
-        let cols = tile.cols.1 - tile.cols.0;
-        let mut done = true;
-        for j in tile.rows.0..tile.rows.1 {
-            let base = (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2;
-            for k in (0..job.batch).step_by(BLOCK) {
-                let clip = (0, job.src[0] as isize);
-                let lines = Lines { base, pitch: src.plane, first: first + k as isize, clip };
-                let at = (k * job.plane() + tile.span(job, j).start, job.plane());
-                done &= T::sums(level, src.data, lines, w, BLOCK.min(job.batch - k), cols, b.planes.s, at);
-            }
-        }
-        if done {
-            return;
-        }
-    }
     for j in tile.rows.0..tile.rows.1 {
         for x in (tile.cols.0..tile.cols.1).step_by(width) {
             let cols = width.min(tile.cols.1 - x);

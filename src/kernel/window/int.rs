@@ -8,7 +8,7 @@ use super::along::SLACK;
 use super::emit::{Emit, IntRow};
 use super::estimate::{Acc, Code, RowSum, Width};
 use super::lines::{self, Add, Block, Coding, Elem, Lines, Masked, Op, Sources};
-use super::plan::{Job, Plain, Tile, bits, cut, padded};
+use super::plan::{Job, Plain, Stage, Tile, bits, cut, padded};
 use crate::grid::View;
 use crate::kernel::simd::Level;
 
@@ -147,8 +147,11 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
 ) -> usize {
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
-    let rows =
-        padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
+    let stage = padded::<T>(Stage::len(job, size_of::<T>()));
+    let rows = stage
+        + padded::<T>(2 * job.pitch)
+        + padded::<T>(deep_len(job))
+        + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
@@ -316,6 +319,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let deep = cut::<T>(bytes, k * deep_len(job));
     let out_lo = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
     let out_hi = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let stage = cut::<T>(bytes, k * Stage::len(job, size_of::<T>()));
     let mut s1 = Moment::<Z1, Y1, X1>::cut(job, needs.mean, bytes);
     let mut s2 = Moment::<Z2, Y2, X2>::cut(job, needs.variance, bytes);
     let mut count = Moment::<u32, u32, u32>::cut(job, M, bytes);
@@ -364,7 +368,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
         }
         for z0 in (0..job.dst[0]).step_by(job.batch) {
             if needs.extremes {
-                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep);
+                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep, stage);
             }
             for z in z0..(z0 + job.batch).min(job.dst[0]) {
                 let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
@@ -429,7 +433,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
 
 /// Extremes over z of a batch of output planes, straight from `src`.
 #[allow(clippy::too_many_arguments)]
-fn planes_extremes<T: Code, const M: bool>(
+fn planes_extremes<T: Code + Plain, const M: bool>(
     level: Level,
     job: &Job,
     tile: &Tile,
@@ -439,22 +443,19 @@ fn planes_extremes<T: Code, const M: bool>(
     lo: &mut [T],
     hi: &mut [T],
     work: &mut [T],
+    buffer: &mut [T],
 ) {
     let cols = tile.cols.1 - tile.cols.0;
+    let stage = Stage::new(job, size_of::<T>(), z0);
     for j in tile.rows.0..tile.rows.1 {
-        let lines = Lines {
-            base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
-            pitch: src.plane,
-            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
-            clip: (0, job.src[0] as isize),
-        };
+        let (from, lines) = stage.fill(tile, src, j, buffer);
         let out = (tile.span(job, j).start, job.plane());
         blocked(
             level,
             (job.batch, job.block),
             Masked::<M>,
             Sources::<false>,
-            [src.data; 2],
+            [from; 2],
             lines,
             job.window[0],
             cols,

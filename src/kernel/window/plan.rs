@@ -1,7 +1,7 @@
 //! Which moments a set of channels needs, how a call is cut into tiles, and how its scratch is laid out.
 
-use super::lines::DEEP;
-use crate::grid::{DType, Shape};
+use super::lines::{DEEP, Lines};
+use crate::grid::{DType, Shape, View};
 use crate::stage::{Method, WindowChannel, WindowParams};
 
 /// Moments to compute.
@@ -122,6 +122,50 @@ const TILE_BYTES: usize = 640 << 10;
 /// Parts as even as can be of at most `most`.
 fn even(n: usize, most: usize) -> usize {
     n.div_ceil(n.div_ceil(most).max(1)).max(1)
+}
+
+/// The lines of one buffer row that a batch reads along z, copied side by side: planes lie a power of two apart in many
+/// volumes, and then few cache sets hold all of a column. 2-core Zen 4 VM, AVX-512, 2026-11-23, 256 x 256 planes,
+/// cdf_power r=10 in ns/voxel (u8, u16, f32): STAGED, against DIRECT read in place.
+pub struct Stage {
+    /// Planes of `src`, half-open.
+    planes: (usize, usize),
+    first: isize,
+    pitch: usize,
+}
+
+impl Stage {
+    /// For the batch that starts at output plane `z0`.
+    pub fn new(job: &Job, size: usize, z0: usize) -> Stage {
+        let first = (job.at[0] + z0) as isize - job.radius[0] as isize;
+        let end = (first + (job.batch + job.window[0] - 1) as isize).min(job.src[0] as isize);
+        Stage { planes: (first.max(0) as usize, end as usize), first, pitch: Self::pitch(job, size) }
+    }
+
+    /// An odd number of cache lines.
+    fn pitch(job: &Job, size: usize) -> usize {
+        (((job.tile[1] + 2 * job.radius[2]) * size).div_ceil(64) | 1) * 64 / size
+    }
+
+    /// Elements of the buffer: none for windows so long that they are read in place.
+    pub fn len(job: &Job, size: usize) -> usize {
+        if job.window[0] < DEEP { (job.batch + job.window[0] - 1).min(job.src[0]) * Self::pitch(job, size) } else { 0 }
+    }
+
+    /// Copies the lines of buffer row `j` into `buffer`, if it holds them, and says where to read them.
+    pub fn fill<'a, T: Plain>(&self, tile: &Tile, src: View<'a, T>, j: usize, buffer: &'a mut [T]) -> (&'a [T], Lines) {
+        let (y, x) = (tile.rows.2 + j - tile.rows.0, tile.cols.2);
+        if buffer.is_empty() {
+            let clip = (0, src.shape[0] as isize);
+            return (src.data, Lines { base: y * src.row + x, pitch: src.plane, first: self.first, clip });
+        }
+        let cols = tile.cols.1 - tile.cols.0;
+        for (i, z) in (self.planes.0..self.planes.1).enumerate() {
+            buffer[i * self.pitch..][..cols].copy_from_slice(&src.row_at(z, y)[x..x + cols]);
+        }
+        let clip = (0, (self.planes.1 - self.planes.0) as isize);
+        (buffer, Lines { base: 0, pitch: self.pitch, first: self.first - self.planes.0 as isize, clip })
+    }
 }
 
 /// A multiple of 64 elements, odd in 64s: power-of-two pitches would map a column to few cache sets.
