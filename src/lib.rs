@@ -11,6 +11,7 @@
 //! | [`kernel`] | voxels to voxels on the CPU; each fast kernel beside its reference |
 //! | [`store`] | boxes of voxels from and to files |
 //! | [`config`] | TOML text to typed configuration |
+//! | [`gpu`] | window kernels on a GPU, their facts for the planner |
 //! | [`plan`] | graph to plan: lattices, halos, fusing, bricks, tasks, peak bytes |
 //! | [`run`] | executes a plan: readers, workers, writers, byte budget, journal |
 //! | [`cli`] | commands, messages, reports |
@@ -22,6 +23,7 @@ pub mod brick;
 pub mod cli;
 pub mod config;
 pub mod error;
+pub mod gpu;
 pub mod grid;
 pub mod kernel;
 pub mod plan;

@@ -16,7 +16,8 @@ use crate::store::{Source, open_inputs};
 pub fn explain(config: &Config) -> Result<(String, Value)> {
     let sources = open_inputs(config)?;
     let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
-    let plan = Plan::new(config, &infos)?;
+    let mut gpu = None;
+    let plan = Plan::new(config, &infos, &mut || crate::gpu::find(config.run.device, &mut gpu))?;
     Ok((text(config, &plan, &sources), describe(config, &plan, &sources)))
 }
 

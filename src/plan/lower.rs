@@ -547,7 +547,6 @@ impl Lowering<'_> {
                 if self.out.graph.wires[w].dtype.result() == DType::F64 { DType::F64 } else { d }
             })
         };
-        let dtype = if matches!(node.op, Op::Obscurance(_)) { DType::F32 } else { dtype };
         let missing = if extreme { src.missing } else { None };
         let wire = Wire {
             name: format!("{}.{channel}", node.name),

@@ -3,6 +3,7 @@
 use super::graph::{Step, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
+use crate::gpu::{facts, passes};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, obscurance, rank, reduce, window};
 
@@ -73,12 +74,46 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Gaussian { sigma, channels } => gaussian::scratch_bytes(dtype, src, dst, *sigma, channels.len() > 1),
         StepKind::Gradient { size, .. } => gradient::scratch_bytes(dtype, src, dst, *size),
         StepKind::Obscurance { params, colour, normal, .. } => {
-            obscurance::Prepared::new(params).scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
+            let sweep = obscurance::Prepared::new(params);
+            let wide = dtype.result() == DType::F64;
+            sweep.scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
+                + narrowed(src, colour.is_some())
+                + narrowed(dst, normal.is_some())
+                + narrowed(dst, wide)
         }
         _ => 0,
     };
     let mask = if step.mask.is_some() { dst.iter().product() } else { 0 };
     (kernel + copy + mask) as u64
+}
+
+/// f32 copies of three components that a sweep reads or writes.
+fn narrowed(shape: Shape, used: bool) -> usize {
+    if used { shape.iter().product::<usize>() * 12 } else { 0 }
+}
+
+/// Staging of the GPU lane for bricks of this shape, and its device buffers where they are this process's memory. Slots
+/// stay alive between bricks.
+fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
+    let Some(gpu) = &plan.gpu else { return 0 };
+    let cap = gpu.buffer_cap(plan.memory);
+    let mut sizes = passes::Sizes::default();
+    for &s in group.steps.iter().filter(|&&s| plan.on_gpu(s)) {
+        let step = &plan.graph.steps[s];
+        let StepKind::Window { params, channels } = &step.kind else { continue };
+        let dst = grown(group.brick.shape, step.halo, group.shape);
+        let src: Shape = std::array::from_fn(|a| {
+            let padded = dst[a] + 2 * step.reach[a];
+            if step.border == Border::Clip { padded.min(group.shape[a]) } else { padded }
+        });
+        let at = std::array::from_fn(|a| step.reach[a].min(src[a] - dst[a]));
+        let needs = window::Needs::of(channels.iter().copied(), false);
+        let dtype = plan.graph.wires[step.inputs[0]].dtype;
+        if let Some(job) = passes::Job::new(dtype, src, dst, at, params.radius, needs) {
+            sizes = sizes.max(job.slot(cap));
+        }
+    }
+    facts::SLOTS * sizes.host_bytes(gpu.software)
 }
 
 /// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.
@@ -109,9 +144,9 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
     written + encoded + cells + map
 }
 
-/// Open chunks of the levels between their first and last brick, for one task, all outputs.
+/// Open chunks of the levels between their first and last brick, for one task, all outputs; and the GPU lane's buffers.
 pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
-    let mut total = 0;
+    let mut total = gpu_bytes(plan, group);
     for &o in &group.outputs {
         let output = &plan.outputs[o];
         if !output.is_zarr() {

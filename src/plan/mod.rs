@@ -17,7 +17,9 @@ pub use explain::explain;
 pub use outputs::{MapPlan, OutputPlan};
 pub use tasks::{Group, Task};
 
-use crate::config::Config;
+use crate::config::{Config, Device};
+use crate::gpu::{GpuFacts, facts};
+use crate::grid::Border;
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 
@@ -36,6 +38,9 @@ pub enum PrepassKind {
     MinMax,
 }
 
+/// Finds a GPU, or says what was looked for.
+pub type FindGpu<'a> = &'a mut dyn FnMut() -> Result<GpuFacts, String>;
+
 /// All that a run needs to know.
 #[derive(Debug)]
 pub struct Plan {
@@ -49,12 +54,15 @@ pub struct Plan {
     pub memory: u64,
     pub warnings: Vec<String>,
     /// Why stages run where they run, one line each.
-    pub placement: Vec<(String, &'static str, String)>,
+    pub placement: Placement,
+    /// The adapter that the steps placed on "gpu" run on.
+    pub gpu: Option<GpuFacts>,
 }
 
 impl Plan {
     /// Plans a run of `config` on volumes with these facts (the config's inputs, in order). Opens no file.
-    pub fn new(config: &Config, infos: &[VolumeInfo]) -> Result<Plan> {
+    /// `find_gpu` is called at most once, when a GPU could be used.
+    pub fn new(config: &Config, infos: &[VolumeInfo], find_gpu: FindGpu) -> Result<Plan> {
         let mut lowered = lower::lower(config, infos)?;
         let outputs = outputs::plan_outputs(config, infos, &mut lowered)?;
         let threads = match config.run.threads {
@@ -62,7 +70,7 @@ impl Plan {
             n => n,
         };
         let graph = lowered.graph;
-        let placement = placement(config, &graph)?;
+        let (placement, gpu) = placement(config, &graph, find_gpu)?;
         let warnings = warnings(&graph);
         let mut plan = Plan {
             groups: Vec::new(),
@@ -73,6 +81,7 @@ impl Plan {
             memory: config.run.memory,
             warnings,
             placement,
+            gpu,
         };
         plan.groups = tasks::groups(&plan, config)?;
         for g in 0..plan.groups.len() {
@@ -101,6 +110,17 @@ impl Plan {
         self.groups.iter().map(|g| g.region.voxels() as u64).sum()
     }
 
+    /// What `auto` has to say when it wanted a GPU and found none.
+    pub fn gpu_note(&self, config: &Config) -> Option<String> {
+        let (_, _, why) = self.placement.iter().find(|p| p.2.starts_with(NO_GPU))?;
+        (config.run.device == Device::Auto).then(|| format!("device = \"auto\": running on the CPU, {why}"))
+    }
+
+    /// Whether a step was placed on the GPU.
+    pub fn on_gpu(&self, step: StepId) -> bool {
+        self.placement[step].1 == "gpu"
+    }
+
     /// Tasks of all groups; their numbers are dense.
     pub fn task_count(&self) -> usize {
         self.groups.iter().map(|g| g.task_count()).sum()
@@ -112,21 +132,55 @@ impl Plan {
     }
 }
 
-/// Device of every stage, with the reason. This build has CPU kernels only.
-fn placement(config: &Config, graph: &Graph) -> Result<Vec<(String, &'static str, String)>> {
-    use crate::config::Device;
-    let reason = match config.run.device {
-        Device::Cpu => "device = \"cpu\"",
-        Device::Auto => "no GPU kernels in this build",
+/// How the reason begins where a GPU would have been used.
+const NO_GPU: &str = "no GPU: ";
+
+/// Stage, device and reason of every step.
+pub type Placement = Vec<(String, &'static str, String)>;
+
+/// Whether a step that reads `input` has a GPU kernel, or why not.
+fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static str> {
+    let channels = match &step.kind {
+        graph::StepKind::Window { channels, .. } => channels,
+        graph::StepKind::Rank { .. } => return Err(facts::EXACT),
+        _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
+    };
+    if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {
+        return Err(
+            "the border's constant makes floats of the voxels, for which there is no GPU kernel: runs on the CPU",
+        );
+    }
+    facts::window(input.dtype, input.missing.is_some(), channels)
+}
+
+/// Device of every step. An adapter is looked for where one is demanded, or where `auto` has a step for it.
+fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement, Option<GpuFacts>)> {
+    let supported = |s: &graph::Step| gpu_kernel(s, &graph.wires[s.inputs[0]]);
+    let any = graph.steps.iter().any(|s| supported(s).is_ok());
+    let found = match config.run.device {
+        Device::Cpu => None,
+        Device::Auto => any.then(find),
         Device::Gpu | Device::GpuSoftware => {
-            return Err(Error::Failed(
-                "run.device: \"gpu\" was asked for, and no GPU was found: this build has no GPU kernels (looked for: a \
-                 wgpu back end); use device = \"cpu\" or \"auto\""
-                    .into(),
-            ));
+            let facts = find().map_err(|why| {
+                let name = if config.run.device == Device::Gpu { "gpu" } else { "gpu:software" };
+                Error::Failed(format!(
+                    "run.device: \"{name}\" was asked for, and no such GPU can be used: {why}; use device = \"cpu\" or \"auto\""
+                ))
+            })?;
+            Some(Ok(facts))
         }
     };
-    Ok(graph.steps.iter().map(|s| (s.stages.join("+"), "cpu", reason.to_string())).collect())
+    let place = |s: &graph::Step| match (&found, supported(s)) {
+        (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
+        (_, Err(why)) => ("cpu", why.to_string()),
+        (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
+        (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
+        (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),
+    };
+    let places: Placement =
+        graph.steps.iter().map(|s| (s, place(s))).map(|(s, p)| (s.stages.join("+"), p.0, p.1)).collect();
+    let used = places.iter().any(|p| p.1 == "gpu");
+    Ok((places, found.and_then(|f| f.ok()).filter(|_| used)))
 }
 
 /// Windows of equal voxel radius on unequal spacing are long in space: say so.

@@ -119,7 +119,7 @@ impl OutputPlan {
     /// Whether every file of level `k` belongs to one task of these edges.
     pub fn owned(&self, k: usize, group: &Group) -> bool {
         if !self.is_zarr() {
-            return k == 0;
+            return k == self.first_level();
         }
         let (Some(level), file, shape) = (self.level(k), self.commit_shape(), group.region.shape()) else {
             return false;

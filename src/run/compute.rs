@@ -8,6 +8,7 @@ use super::read::Loaded;
 use super::steps::{Engine, MaskValue};
 use super::trace::Trace;
 use super::value::Value;
+use crate::Result;
 use crate::brick::Scratch;
 use crate::grid::Region;
 use crate::plan::graph::{StepId, WireId};
@@ -33,6 +34,9 @@ impl Finished {
 }
 
 /// Runs every step that the sinks need. Counts the brick as computed, or as skipped and why.
+///
+/// # Errors
+/// A GPU that failed twice.
 pub fn evaluate(
     engine: &Engine,
     program: &Program,
@@ -40,7 +44,7 @@ pub fn evaluate(
     scratch: &mut Scratch,
     metrics: &Metrics,
     trace: &Trace,
-) -> Finished {
+) -> Result<Finished> {
     let Loaded { brick, mut values, mut masks, all_missing } = loaded;
     let plan = engine.plan;
     let volume = Region::whole(program.volume);
@@ -65,7 +69,7 @@ pub fn evaluate(
         let outputs = if off.contains(&s) {
             engine.filled(step, region)
         } else {
-            engine.run(s, &mut values, known, region, volume, scratch)
+            engine.run(s, &mut values, known, region, volume, scratch)?
         };
         if matches!(known, MaskValue::None) {
             masked = true;
@@ -98,5 +102,5 @@ pub fn evaluate(
         (false, false, true) => metrics.skipped("constant"),
         _ => metrics.computed(),
     }
-    Finished { brick, values, masks }
+    Ok(Finished { brick, values, masks })
 }

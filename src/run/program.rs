@@ -1,7 +1,7 @@
 //! What is evaluated for each brick: steps in order, wires to deliver, and when a buffer is free again.
 
 use crate::grid::{Region, Shape};
-use crate::plan::graph::{StepId, WireId};
+use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
 use crate::plan::tasks::{Group, input_halo, inputs_of};
 use crate::plan::{Plan, Prepass};
@@ -52,14 +52,17 @@ impl Program {
         wire_box(brick, plan.graph.steps[step].halo, self.volume)
     }
 
-    /// Wires that must be made or read, given the steps that a mask switched off.
+    /// Wires that must be made or read, given the steps that a mask switched off. Inputs that only masks look at are not
+    /// among them: the reader looks at those by itself.
     pub fn needed(&self, plan: &Plan, switched_off: &[StepId]) -> Vec<bool> {
         let mut needed = vec![false; plan.graph.wires.len()];
         self.sinks.iter().for_each(|&w| needed[w] = true);
         for &s in self.steps.iter().rev() {
             let step = &plan.graph.steps[s];
             if !switched_off.contains(&s) && step.outputs.iter().any(|&w| needed[w]) {
-                step.inputs.iter().chain(step.mask.as_ref().map(|m| &m.wire)).for_each(|&w| needed[w] = true);
+                let mask = step.mask.as_ref().map(|m| m.wire);
+                let made = mask.filter(|&w| matches!(plan.graph.wires[w].producer, Producer::Step(_)));
+                step.inputs.iter().copied().chain(made).for_each(|w| needed[w] = true);
             }
         }
         needed

@@ -22,7 +22,8 @@ use super::stream::{Stream, Work};
 use super::trace::Trace;
 use super::{second, windows};
 use crate::brick::{Pool, Scratch};
-use crate::config::{Config, config_hash};
+use crate::config::{Config, Device, config_hash};
+use crate::gpu::{self, Gpu};
 use crate::grid::{Region, order::morton};
 use crate::plan::{BrickChoice, Group, Plan};
 use crate::store::sink::Sink;
@@ -38,6 +39,7 @@ pub struct Session<'a> {
     options: &'a RunOptions,
     progress: &'a dyn Progress,
     plan: Plan,
+    gpu: Option<Gpu>,
     infos: Vec<VolumeInfo>,
     identities: Vec<Value>,
     hash: String,
@@ -74,11 +76,12 @@ impl<'a> Session<'a> {
             return Err(Error::Failed(format!("{} sources for {} inputs", sources.len(), config.inputs.len())));
         }
         let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
-        let plan = Plan::new(config, &infos)?;
+        let (plan, gpu) = plan_and_gpu(config, &infos, options.resume)?;
         plan.warnings.iter().for_each(|w| progress.note(w));
+        plan.gpu_note(config).iter().for_each(|n| progress.note(n));
         let identities = sources.iter().map(Source::identity).collect::<Result<Vec<_>>>()?;
         let hash = config_hash(config);
-        let placement = json!(plan.placement.iter().map(|(n, d, _)| (n.clone(), *d)).collect::<Vec<_>>());
+        let placement = placement_json(&plan);
         let header = journal::header(&hash, &identities, plan.task_count(), &placement, &[]);
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
         let threads = rayon::ThreadPoolBuilder::new()
@@ -94,6 +97,7 @@ impl<'a> Session<'a> {
             metrics: Metrics::new(plan.graph.steps.len()),
             targets: plan.outputs.iter().map(|_| None).collect(),
             plan,
+            gpu,
             infos,
             identities,
             hash,
@@ -248,7 +252,7 @@ impl<'a> Session<'a> {
     }
 
     fn engine(&self) -> Engine<'_> {
-        let mut engine = Engine::new(&self.plan, &self.pool, !self.options.no_skip);
+        let mut engine = Engine::new(&self.plan, &self.pool, self.gpu.as_ref(), !self.options.no_skip);
         engine.globals = self.globals.clone();
         engine
     }
@@ -421,7 +425,8 @@ impl<'a> Session<'a> {
         report.memory_budget_bytes = self.plan.memory;
         for (s, step) in self.plan.graph.steps.iter().enumerate() {
             let (seconds, voxels) = self.metrics.step_totals(s);
-            report.stages.push(StageReport { name: step.stages.join("+"), seconds, device: "cpu".into(), voxels });
+            let device = self.plan.placement[s].1.into();
+            report.stages.push(StageReport { name: step.stages.join("+"), seconds, device, voxels });
         }
         report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();
         report
@@ -431,6 +436,27 @@ impl<'a> Session<'a> {
     pub fn elapsed(&self) -> Duration {
         Duration::from_secs_f64(self.metrics.seconds())
     }
+}
+
+/// The placement as the journal keeps it.
+fn placement_json(plan: &Plan) -> Value {
+    json!(plan.placement.iter().map(|(n, d, _)| (n.clone(), *d)).collect::<Vec<_>>())
+}
+
+/// Plans, and opens the GPU where a step runs on it. With `auto`, a run that was begun without a GPU goes on without one.
+fn plan_and_gpu(config: &Config, infos: &[VolumeInfo], resume: bool) -> Result<(Plan, Option<Gpu>)> {
+    let mut opened = None;
+    let plan = Plan::new(config, infos, &mut || gpu::find(config.run.device, &mut opened))?;
+    let Some(facts) = &plan.gpu else { return Ok((plan, None)) };
+    let earlier = if resume { Journal::read(&outputs::journal_dir(&plan)) } else { None };
+    if config.run.device == Device::Auto && earlier.is_some_and(|e| e.header["placement"] != placement_json(&plan)) {
+        let without = Plan::new(config, infos, &mut || Err("the run was begun without one".into()))?;
+        return Ok((without, None));
+    }
+    if let Some(gpu) = &mut opened {
+        gpu.set_cap(facts.buffer_cap(plan.memory));
+    }
+    Ok((plan, opened))
 }
 
 impl Drop for Session<'_> {

@@ -5,7 +5,8 @@ use std::collections::HashMap;
 use super::value::{Comp, Value};
 use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
-use crate::grid::{Affine, AnyView, AnyViewMut, Border, Region, Shape, View, ViewMut, Voxel};
+use crate::gpu::Gpu;
+use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut, Voxel};
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::simd::Level;
 use crate::kernel::window::WindowOut;
@@ -15,6 +16,7 @@ use crate::plan::graph::{
     GradientChannel, Mask, Moment, ObscuranceChannel, Step, StepId, StepKind, TransferChannel, Wire,
 };
 use crate::stage::WindowParams;
+use crate::{Error, Result};
 
 /// What all bricks of a run share.
 pub struct Engine<'a> {
@@ -26,6 +28,8 @@ pub struct Engine<'a> {
     /// Constants are propagated instead of computed.
     pub skip: bool,
     pub pool: &'a Pool,
+    /// Runs the steps that the plan placed on it.
+    pub gpu: Option<&'a Gpu>,
 }
 
 /// A mask over a step's output box: 1 = needed.
@@ -37,14 +41,14 @@ pub enum MaskValue {
 }
 
 impl<'a> Engine<'a> {
-    pub fn new(plan: &'a Plan, pool: &'a Pool, skip: bool) -> Engine<'a> {
+    pub fn new(plan: &'a Plan, pool: &'a Pool, gpu: Option<&'a Gpu>, skip: bool) -> Engine<'a> {
         let sweeps = (plan.graph.steps.iter().enumerate())
             .filter_map(|(i, s)| match &s.kind {
                 StepKind::Obscurance { params, .. } => Some((i, Prepared::new(params))),
                 _ => None,
             })
             .collect();
-        Engine { plan, level: Level::detect(), sweeps, globals: Vec::new(), skip, pool }
+        Engine { plan, level: Level::detect(), sweeps, globals: Vec::new(), skip, pool, gpu }
     }
 
     /// The mask of a step over `region`, from its wire's value.
@@ -88,6 +92,9 @@ impl<'a> Engine<'a> {
     }
 
     /// Computes a step on `region`; `values` holds its inputs, each covering what it needs.
+    ///
+    /// # Errors
+    /// A GPU that failed twice.
     pub fn run(
         &self,
         id: StepId,
@@ -96,30 +103,30 @@ impl<'a> Engine<'a> {
         region: Region,
         volume: Region,
         scratch: &mut Scratch,
-    ) -> Vec<Value> {
+    ) -> Result<Vec<Value>> {
         let step = &self.plan.graph.steps[id];
         if let MaskValue::None = mask {
-            return self.filled(step, region);
+            return Ok(self.filled(step, region));
         }
         if self.skip
             && matches!(mask, MaskValue::All)
-            && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)
+            && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)?
         {
-            return values;
+            return Ok(values);
         }
         for &w in &step.inputs {
             if let Some(value) = &mut values[w] {
                 value.materialize(self.pool);
             }
         }
-        let mut outputs = self.compute(id, &inputs_of(step, values), region, volume, scratch);
+        let mut outputs = self.compute(id, &inputs_of(step, values), region, volume, scratch)?;
         if let MaskValue::Some(needed) = mask {
             for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
                 let fill = self.plan.graph.wires[w].fill;
                 value.comps.iter_mut().for_each(|c| fill_where(c, needed, fill));
             }
         }
-        outputs
+        Ok(outputs)
     }
 
     /// A step of constants is the same step on one voxel: the kernel itself says what comes out.
@@ -130,11 +137,11 @@ impl<'a> Engine<'a> {
         region: Region,
         volume: Region,
         scratch: &mut Scratch,
-    ) -> Option<Vec<Value>> {
+    ) -> Result<Option<Vec<Value>>> {
         let step = &self.plan.graph.steps[id];
-        let constants = inputs.iter().map(|v| v.constants()).collect::<Option<Vec<_>>>()?;
+        let Some(constants) = inputs.iter().map(|v| v.constants()).collect::<Option<Vec<_>>>() else { return Ok(None) };
         if matches!(step.border, Border::Constant(_)) && !volume.contains(&region.grow(step.reach)) {
-            return None;
+            return Ok(None);
         }
         let one = Region::whole([1, 1, 1]);
         let small: Vec<Value> = inputs
@@ -149,7 +156,7 @@ impl<'a> Engine<'a> {
                 Value { dtype: v.dtype, region: one, comps: comps.collect() }
             })
             .collect();
-        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), one, one, scratch);
+        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), one, one, scratch)?;
         let spread = |value: Value| {
             let comps = value.comps.iter().map(|c| match c {
                 Comp::Const(v) => Comp::Const(*v),
@@ -157,7 +164,7 @@ impl<'a> Engine<'a> {
             });
             Value { dtype: value.dtype, region, comps: comps.collect() }
         };
-        Some(outputs.into_iter().map(spread).collect())
+        Ok(Some(outputs.into_iter().map(spread).collect()))
     }
 
     fn compute(
@@ -167,16 +174,10 @@ impl<'a> Engine<'a> {
         region: Region,
         volume: Region,
         scratch: &mut Scratch,
-    ) -> Vec<Value> {
+    ) -> Result<Vec<Value>> {
         let step = &self.plan.graph.steps[id];
         let wires: Vec<&Wire> = step.outputs.iter().map(|&w| &self.plan.graph.wires[w]).collect();
-        let mut outputs: Vec<Value> = wires
-            .iter()
-            .map(|w| {
-                let buffer = || Comp::Voxels(self.pool.take(w.dtype, region.voxels()));
-                Value { dtype: w.dtype, region, comps: (0..w.components).map(|_| buffer()).collect() }
-            })
-            .collect();
+        let mut outputs: Vec<Value> = wires.iter().map(|w| self.buffers(w.dtype, region, w.components)).collect();
         let mut cx = Context { level: self.level, scratch };
         let input_wire = &self.plan.graph.wires[step.inputs[0]];
         match &step.kind {
@@ -212,18 +213,19 @@ impl<'a> Engine<'a> {
             StepKind::Window { .. } | StepKind::Rank { .. } | StepKind::Gaussian { .. } => {
                 for c in 0..input_wire.components {
                     let src = self.windowed(step, inputs[0], c, input_wire, region, volume);
-                    self.windows(step, &src, &mut outputs, c, &mut cx);
+                    self.windows(id, &src, &mut outputs, c, &mut cx)?;
                     repair_missing(&wires, inputs[0], c, input_wire, &mut outputs, region);
                     src.recycle(self.pool);
                 }
             }
             _ => self.pointwise(step, inputs, &mut outputs, region),
         }
-        outputs
+        Ok(outputs)
     }
 
     /// Window, rank or Gaussian of one component.
-    fn windows(&self, step: &Step, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) {
+    fn windows(&self, id: StepId, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) -> Result<()> {
+        let step = &self.plan.graph.steps[id];
         match &step.kind {
             StepKind::Window { params, channels } => {
                 let params = WindowParams { missing: src.missing, ..*params };
@@ -232,7 +234,14 @@ impl<'a> Engine<'a> {
                     .zip(outputs)
                     .map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, c) })
                     .collect();
-                window::window(src.view(), &params, src.at, &mut outs, cx);
+                // A single voxel stands for a constant brick: not worth the way to the device, and the bits are the same.
+                let single = outs.iter().all(|o| o.dst.shape() == [1, 1, 1]);
+                match self.gpu.filter(|_| self.plan.on_gpu(id) && !single) {
+                    Some(gpu) => gpu.window(src.view(), &params, src.at, &mut outs, cx).map(|_| ()).map_err(|e| {
+                        Error::Failed(format!("{} on the GPU: {e}; --resume continues", step.stages.join("+")))
+                    })?,
+                    None => window::window(src.view(), &params, src.at, &mut outs, cx),
+                }
             }
             StepKind::Rank { params, shape, ties } => {
                 let params = WindowParams { missing: src.missing, ..*params };
@@ -250,6 +259,7 @@ impl<'a> Engine<'a> {
             }
             _ => unreachable!("only window kernels come here"),
         }
+        Ok(())
     }
 
     #[allow(clippy::too_many_arguments)]
@@ -274,8 +284,15 @@ impl<'a> Engine<'a> {
             std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
         });
         let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
+        // Sweeps sum in fixed point and round to f32; results of f64 data are widened.
+        let wide = outputs[0].dtype == DType::F64;
+        let mut narrow_outputs: Vec<Value> = Vec::new();
+        if wide {
+            narrow_outputs = outputs.iter().map(|v| self.buffers(DType::F32, region, v.comps.len())).collect();
+        }
+        let targets = if wide { &mut narrow_outputs[..] } else { &mut *outputs };
         let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
-        for (channel, value) in channels.iter().zip(outputs) {
+        for (channel, value) in channels.iter().zip(targets) {
             let mut views = views_mut(value);
             match channel {
                 ObscuranceChannel::Openness => io.openness = views.pop(),
@@ -283,6 +300,18 @@ impl<'a> Engine<'a> {
             }
         }
         sweep.sweep(inputs[0].view(0, src_box), src_box, region, io, cx);
+        for (from, to) in narrow_outputs.into_iter().zip(outputs) {
+            for c in 0..from.comps.len() {
+                pointwise::scale(from.view(c, region), Affine::IDENTITY, None, view_mut(to, c));
+            }
+            from.recycle(self.pool);
+        }
+    }
+
+    /// Uninitialised voxels for a value.
+    fn buffers(&self, dtype: DType, region: Region, comps: usize) -> Value {
+        let buffer = || Comp::Voxels(self.pool.take(dtype, region.voxels()));
+        Value { dtype, region, comps: (0..comps).map(|_| buffer()).collect() }
     }
 
     fn pointwise(&self, step: &Step, inputs: &[&Value], outputs: &mut [Value], region: Region) {

@@ -157,7 +157,7 @@ impl<W: Send> Stream<'_, W> {
         let mut scratch = scratches[worker].lock().unwrap_or_else(|e| e.into_inner());
         let result = guarded(|| {
             let engine = self.reader.engine;
-            let done = evaluate(engine, self.reader.program, loaded, &mut scratch, self.metrics, self.trace);
+            let done = evaluate(engine, self.reader.program, loaded, &mut scratch, self.metrics, self.trace)?;
             let start = Instant::now();
             let written = (self.deliver)(&done, work, &mut scratch);
             self.metrics.encode_ns.fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);

@@ -1,12 +1,13 @@
 //! From exact integer sums of one row of windows to results. Codes are unsigned: a stored value is `code - offset`.
 
+use super::along::RowSums;
 use super::beta::{self, Terms};
 use super::lines::Elem;
 use super::math;
 use crate::kernel::simd::Level;
 
 /// Integer that sums are kept in; arithmetic wraps, and the caller proves that final values fit.
-pub trait Acc: Copy + Default + PartialOrd + std::fmt::Debug + 'static {
+pub trait Acc: RowSums + Copy + Default + PartialOrd + std::fmt::Debug + 'static {
     fn plus(self, o: Self) -> Self;
     fn minus(self, o: Self) -> Self;
     fn wide(self) -> u128;
@@ -28,6 +29,7 @@ macro_rules! acc {
     )*};
 }
 acc!(u16 u32 u64 u128);
+impl RowSums for u16 {}
 
 /// The integer that first sums of a row end in: u32 or u64.
 pub trait RowSum: Acc {
@@ -262,15 +264,19 @@ fn cdf_power_as<T: Code, X1: RowSum, const FLIPPED: bool>(
         let c = v[i].code(flip);
         let below = c.above(lo[i]);
         let above = hi[i].above(c);
-        let range = hi[i].above(lo[i]);
+        let small = T::TOP <= u16::MAX as u32; // differences below 2^24: exact
+        let range = if small { below + above } else { hi[i].above(lo[i]) };
         // Sums of (v_i - min) and (max - v_i): exact, so beta keeps its relative accuracy whatever its size.
         let over = s1[i].minus(X1::times(n[i], lo[i].u32())).f32();
         let under = X1::times(n[i], hi[i].u32()).minus(s1[i]).f32();
         let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
-        let beta = p / q;
+        // One division for both quotients; range and q are at least 1 unless all is constant, their product below 2^96.
+        let inverse = 1.0 / (range * q);
+        let beta = p * range * inverse;
         let beta = if beta > 1e-6 { beta } else { 1e-6 };
         let beta = if beta < 1e6 { beta } else { 1e6 };
-        let y = math::power(a, b, range, beta);
+        let near = 3.0 * b < range;
+        let y = math::power_of(if near { -b } else { a } * (q * inverse), near, beta);
         let y = if a == 0.0 { 0.0 } else { y };
         let y = if b == 0.0 { 1.0 } else { y };
         out[i] = if range == 0.0 { constant } else { y };

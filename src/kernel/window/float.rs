@@ -1,27 +1,33 @@
 //! Float volumes: extremes exactly, sums and (mean, M2) merges along a tree that depends on the window alone, so that
 //! neither the brick nor a NaN elsewhere in it shows in a single bit.
 
+use super::along::SLACK;
+use super::columns::{self, BLOCK, Columns};
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
 use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, deep_len, rows_extremes};
-use super::lines::{self, Add, Coding, Elem, Hi, Lines, Lo, Masked, Op, Sources};
+use super::lines::{self, Add, Coding, Elem, Lines, Masked, Op, Sources};
 use super::merge::{Moments, Sum, Wanted, gather, grow, tree_merge};
-use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
+use super::plan::{self, Job, Needs, Plain, Stage, Tile, cut, padded};
 use super::{Context, WindowOut};
 use crate::grid::{AnyViewMut, Shape, View};
 use crate::kernel::simd::Level;
 use crate::stage::{WindowChannel, WindowParams};
 
 /// f32 (sums in f64) or f64 (sums in pairs of f64).
-pub trait Float: Elem + Plain + Centre {
+pub trait Float: Elem + Plain + Centre + Columns<Self::Total> {
+    /// A strip of NaN, a line that does not exist.
+    const NOTHING: &'static [Self];
     fn row_of<'a>(dst: &'a mut AnyViewMut, at: [usize; 3], len: usize) -> Option<&'a mut [Self]>;
 }
 impl Float for f32 {
+    const NOTHING: &'static [f32] = &[f32::NAN; STRIP];
     fn row_of<'a>(dst: &'a mut AnyViewMut, [z, y, x]: [usize; 3], len: usize) -> Option<&'a mut [f32]> {
         if let AnyViewMut::F32(d) = dst { Some(&mut d.row_at(z, y)[x..x + len]) } else { None }
     }
 }
 impl Float for f64 {
+    const NOTHING: &'static [f64] = &[f64::NAN; STRIP];
     fn row_of<'a>(dst: &'a mut AnyViewMut, [z, y, x]: [usize; 3], len: usize) -> Option<&'a mut [f64]> {
         if let AnyViewMut::F64(d) = dst { Some(&mut d.row_at(z, y)[x..x + len]) } else { None }
     }
@@ -31,15 +37,23 @@ impl Float for f64 {
 /// 2-core Zen 4 VM, AVX-512, 2026-11-23: mean of f32, r=10, 7.6 ns/voxel with 256 columns and column counts
 /// made once per tile, 10.9 with 64 and counts per row (the two were not measured apart; 64 for the rest is by size).
 fn columns(job: &Job) -> usize {
-    if job.needs.variance || job.window[0] > 32 { 64 } else { 256 }
+    if job.needs.variance || job.window[0] > 32 { 64 } else { STRIP }
 }
+
+/// Widest strip.
+const STRIP: usize = 256;
 
 /// Bytes of scratch.
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let k = job.needs.extremes as usize;
-    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
-    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1]);
-    Emit::bytes(job.tile[1]) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
+    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
+    let rows =
+        padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
+    Emit::bytes(job.tile[1])
+        + padded::<T>(Stage::len(job, size_of::<T>()))
+        + padded::<f64>(job.tile[1])
+        + k * (planes + rows)
+        + Buffers::<T::Total>::bytes(job)
 }
 
 /// Moments on their way through the three axes.
@@ -109,12 +123,13 @@ pub fn run<T: Float>(
     let k = needs.extremes as usize;
     let lo = cut::<T>(bytes, k * job.batch * job.plane());
     let hi = cut::<T>(bytes, k * job.batch * job.plane());
-    let row_lo = cut::<T>(bytes, k * job.rows * job.pitch);
-    let row_hi = cut::<T>(bytes, k * job.rows * job.pitch);
+    let row_lo = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
+    let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let work = cut::<T>(bytes, k * 2 * job.pitch);
     let deep = cut::<T>(bytes, k * deep_len(job));
-    let out_lo = cut::<T>(bytes, k * job.tile[1]);
-    let out_hi = cut::<T>(bytes, k * job.tile[1]);
+    let out_lo = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let out_hi = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let stage = cut::<T>(bytes, Stage::len(job, size_of::<T>()));
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
     let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
@@ -126,17 +141,21 @@ pub fn run<T: Float>(
         hi.fill(T::LEAST);
         b.planes.clear();
         for z0 in (0..dst[0]).step_by(job.batch) {
-            if needs.extremes {
-                planes_extremes(level, job, &tile, src, z0, lo, hi, deep);
+            let fast = needs.mean && wanted == Wanted::SUMS && T::COLUMNS && columns::fits(job.window[0]);
+            if needs.extremes || fast {
+                let sums = if fast { &mut *b.planes.s } else { &mut [] };
+                planes_rows(level, job, &tile, src, z0, lo, hi, sums, deep, stage);
             }
-            if needs.mean {
+            if needs.mean && !fast {
                 planes_moments(level, wanted, job, &tile, src, z0, &mut b);
             }
             for z in z0..(z0 + job.batch).min(dst[0]) {
                 let plane = (z - z0) * job.plane();
                 if needs.mean {
                     let from = b.planes.part(plane..plane + job.plane());
-                    tree_merge(level, wanted, &from, job.window[1], job.pitch, &mut b.rows, &mut b.plane_work);
+                    if !plane_sums(level, wanted, job, &tile, from.s, b.rows.s) {
+                        tree_merge(level, wanted, &from, job.window[1], job.pitch, &mut b.rows, &mut b.plane_work);
+                    }
                 }
                 for j in 0..tile.size[0] {
                     if needs.extremes {
@@ -146,8 +165,8 @@ pub fn run<T: Float>(
                         }
                         let line = (j % job.rows) * job.pitch;
                         let w = job.window[2];
-                        lines::tree_extreme(level, Lo, &row_lo[line..line + job.pitch], w, 1, out_lo, work);
-                        lines::tree_extreme(level, Hi, &row_hi[line..line + job.pitch], w, 1, out_hi, work);
+                        let n = job.tile[1];
+                        lines::row_extremes(level, &row_lo[line..], &row_hi[line..], w, n, out_lo, out_hi, work);
                     }
                     if needs.mean {
                         let from = b.rows.part(j * job.pitch..(j + 1) * job.pitch);
@@ -186,7 +205,7 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
     let (level, len) = (emit.level, row.v.len());
     let n = &emit.numerator[..len.min(emit.numerator.len())];
     let needs = Needs::of(emit.outs.iter().map(|o| o.channel), true);
-    if needs.mean {
+    if emit.outs.iter().any(|o| matches!(o.channel, WindowChannel::Mean | WindowChannel::Moment2)) {
         est::mean_row(level, row.s, n, &mut emit.mean[..len]);
     }
     if needs.variance {
@@ -220,9 +239,10 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
     }
 }
 
-/// Extremes over z of a batch of output planes, straight from `src`. NaN never wins a comparison, so it does not count.
+/// Extremes over z of a batch of output planes, and sums where `sums` holds planes for them. NaN never wins a
+/// comparison, so it does not count.
 #[allow(clippy::too_many_arguments)]
-fn planes_extremes<T: Float>(
+fn planes_rows<T: Float>(
     level: Level,
     job: &Job,
     tile: &Tile,
@@ -230,35 +250,50 @@ fn planes_extremes<T: Float>(
     z0: usize,
     lo: &mut [T],
     hi: &mut [T],
+    sums: &mut [T::Total],
     work: &mut [T],
+    buffer: &mut [T],
 ) {
     let cols = tile.cols.1 - tile.cols.0;
     let plain = Coding { flip: T::default(), missing: T::default() };
+    let stage = Stage::new(job, size_of::<T>(), z0);
+    let w = job.window[0];
     for j in tile.rows.0..tile.rows.1 {
-        let lines = Lines {
-            base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
-            pitch: src.plane,
-            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
-            clip: (0, job.src[0] as isize),
-        };
+        let (from, lines) = stage.fill(tile, src, j, buffer);
         let out = (tile.span(job, j).start, job.plane());
-        let (w, from) = (job.window[0], [src.data; 2]);
-        blocked(
-            level,
-            (job.batch, job.block),
-            Masked::<false>,
-            Sources::<false>,
-            from,
-            lines,
-            w,
-            cols,
-            plain,
-            lo,
-            hi,
-            out,
-            work,
-        );
+        if !lo.is_empty() {
+            let (masked, sources, blocks) = (Masked::<false>, Sources::<false>, (job.batch, job.block));
+            blocked(level, blocks, masked, sources, [from; 2], lines, w, cols, plain, lo, hi, out, work);
+        }
+        for k in (0..job.batch).step_by(BLOCK) {
+            if !sums.is_empty() {
+                let lines = Lines { first: lines.first + k as isize, ..lines };
+                let at = (k * job.plane() + out.0, job.plane());
+                T::sums(level, from, lines, w, BLOCK.min(job.batch - k), cols, sums, at);
+            }
+        }
     }
+}
+
+/// Sums over y of a plane, where [`Columns`] has them; else returns false.
+fn plane_sums<A: Sum + Columns<A>>(
+    level: Level,
+    wanted: Wanted,
+    job: &Job,
+    tile: &Tile,
+    plane: &[A],
+    rows: &mut [A],
+) -> bool {
+    let (w, pitch) = (job.window[1], job.pitch);
+    let mut done = wanted == Wanted::SUMS && columns::fits(w);
+    for j in (0..tile.size[0]).step_by(BLOCK) {
+        if done {
+            let lines = Lines { base: 0, pitch, first: j as isize, clip: (0, job.height as isize) };
+            let cols = job.tile[1] + 2 * job.radius[2];
+            done = A::sums(level, plane, lines, w, BLOCK.min(tile.size[0] - j), cols, rows, (j * pitch, pitch));
+        }
+    }
+    done
 }
 
 /// Moments over z of a batch of output planes, strip by strip, straight from `src`.
@@ -288,7 +323,13 @@ fn planes_moments<T: Float>(
             };
             if levels > 0 {
                 for i in 0..job.batch + w - 4 {
-                    join_raw(level, wanted, part(i, i + 4), &mut b.strip_work.part(i * width..i * width + cols), false);
+                    let out = &mut b.strip_work.part(i * width..i * width + cols);
+                    let line = |k: usize| first + (i + k) as isize;
+                    let rows = std::array::from_fn(|k| match line(k) {
+                        z if z < 0 || z >= job.src[0] as isize => T::NOTHING,
+                        z => &src.data[corner + z as usize * src.plane..],
+                    });
+                    four_raw(level, wanted, rows, out);
                 }
                 grow(level, wanted, 2, None, w, width, len, &mut b.strip_work);
             }
@@ -299,6 +340,60 @@ fn planes_moments<T: Float>(
                 join_raw(level, wanted, part(k + done, k + w), out, done > 0);
             }
         }
+    }
+}
+
+/// Moments of four lines of stored voxels, the first level of a tree; NaN stands for a line that does not exist.
+fn four_raw<T: Float>(level: Level, wanted: Wanted, rows: [&[T]; 4], out: &mut Moments<T::Total>) {
+    if wanted.variance {
+        return four_merges(level, rows, out.s, out.m, out.n, out.i);
+    }
+    four_sums(level, rows, out.s);
+    if wanted.counts {
+        for (k, row) in rows.into_iter().enumerate() {
+            raw_counts(level, (row, 0, 1), out.n, k > 0);
+        }
+    }
+}
+
+crate::multiversion! {
+    fn four_sums[T: Float](rows: [&[T]; 4], out: &mut [T::Total]) -> () = four_sums_inner;
+}
+
+#[inline(always)]
+fn four_sums_inner<T: Float>(rows: [&[T]; 4], out: &mut [T::Total]) {
+    let len = out.len();
+    let [a, b, c, d] = rows.map(|r| &r[..len]);
+    for i in 0..len {
+        let [a, b, c, d] = [a[i], b[i], c[i], d[i]].map(|v| weigh(v).0);
+        out[i] = a.plus(b).plus(c.plus(d));
+    }
+}
+
+crate::multiversion! {
+    fn four_merges[T: Float](
+        rows: [&[T]; 4], os: &mut [T::Total], om: &mut [f64], on: &mut [f64], oi: &mut [f64]
+    ) -> () = four_merges_inner;
+}
+
+#[inline(always)]
+fn four_merges_inner<T: Float>(rows: [&[T]; 4], os: &mut [T::Total], om: &mut [f64], on: &mut [f64], oi: &mut [f64]) {
+    let len = os.len();
+    let (om, on, oi) = (&mut om[..len], &mut on[..len], &mut oi[..len]);
+    let [a, b, c, d] = rows.map(|r| &r[..len]);
+    for x in 0..len {
+        let terms = [a[x], b[x], c[x], d[x]].map(weigh);
+        let sum = terms[0].0.plus(terms[1].0).plus(terms[2].0.plus(terms[3].0));
+        let total = terms[0].1 + terms[1].1 + terms[2].1 + terms[3].1;
+        let i = 1.0 / total;
+        let i = if total > 0.0 { i } else { 0.0 };
+        let mean = sum.mean(total, i);
+        let mut square = 0.0;
+        for (s, n) in terms {
+            let d = s.deviation(n, mean);
+            square = (d * d).mul_add(n, square);
+        }
+        (os[x], om[x], on[x], oi[x]) = (sum, square, total, i);
     }
 }
 
@@ -356,13 +451,6 @@ fn raw_sums_inner<T: Float, const M: bool>(
 ) {
     let value = |v: T| if M { weigh(v).0 } else { T::Total::of(v.to_f64()) };
     let len = out.len();
-    if count == 4 && !onto {
-        let [a, b, c, d]: [&[T]; 4] = std::array::from_fn(|k| &src[k * pitch..k * pitch + len]);
-        for i in 0..len {
-            out[i] = value(a[i]).plus(value(b[i])).plus(value(c[i])).plus(value(d[i]));
-        }
-        return;
-    }
     for k in 0..count {
         let row = &src[k * pitch..k * pitch + len];
         if k == 0 && !onto {

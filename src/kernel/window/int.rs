@@ -4,10 +4,11 @@
 //! an axis where the largest final value fits, since wrapped intermediate values cancel. [`run`] is instantiated per
 //! type by [`dispatch`], which checks the bounds.
 
+use super::along::SLACK;
 use super::emit::{Emit, IntRow};
 use super::estimate::{Acc, Code, RowSum, Width};
-use super::lines::{self, Add, Block, Coding, Elem, Hi, Lines, Lo, Masked, Op, Sources};
-use super::plan::{Job, Plain, Tile, cut, padded};
+use super::lines::{self, Add, Block, Coding, Elem, Lines, Masked, Op, Sources};
+use super::plan::{Job, Plain, Stage, Tile, bits, cut, padded};
 use crate::grid::View;
 use crate::kernel::simd::Level;
 
@@ -116,9 +117,9 @@ struct Moment<'a, Z, Y, X> {
     out: &'a mut [X],
 }
 
-/// Elements of a tree along x of a row.
+/// Elements of a tree along x of a row, or of its running sums.
 fn tree_len(job: &Job) -> usize {
-    lines::tree_levels(job.window[2]) * (job.tile[1] + job.window[2])
+    (lines::tree_levels(job.window[2]) * (job.tile[1] + job.window[2])).max(job.pitch + 64)
 }
 
 impl<'a, Z: Plain, Y: Plain, X: Plain> Moment<'a, Z, Y, X> {
@@ -129,13 +130,13 @@ impl<'a, Z: Plain, Y: Plain, X: Plain> Moment<'a, Z, Y, X> {
             row: cut(bytes, k * job.pitch),
             wide: cut(bytes, k * job.pitch),
             work: cut(bytes, k * tree_len(job)),
-            out: cut(bytes, k * job.tile[1]),
+            out: cut(bytes, k * job.tile[1].next_multiple_of(64)),
         }
     }
 
     fn bytes(job: &Job, wanted: bool) -> usize {
         let (z, y) = (padded::<Z>(job.plane()), padded::<Y>(job.pitch));
-        let x = padded::<X>(job.pitch) + padded::<X>(tree_len(job)) + padded::<X>(job.tile[1]);
+        let x = padded::<X>(job.pitch) + padded::<X>(tree_len(job)) + padded::<X>(job.tile[1].next_multiple_of(64));
         wanted as usize * (z + y + x)
     }
 }
@@ -145,8 +146,12 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
     masked: bool,
 ) -> usize {
     let k = job.needs.extremes as usize;
-    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch);
-    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1]);
+    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
+    let stage = padded::<T>(Stage::len(job, size_of::<T>()));
+    let rows = stage
+        + padded::<T>(2 * job.pitch)
+        + padded::<T>(deep_len(job))
+        + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
@@ -257,7 +262,7 @@ fn widen_inner<Y: Acc, X: Acc + From<Y>>(from: &[Y], to: &mut [X]) {
     }
 }
 
-impl<Z: Acc, Y: Acc + From<Z>, X: Acc + From<Y>> Moment<'_, Z, Y, X>
+impl<Z: Acc, Y: Acc + Plain + From<Z>, X: Acc + Plain + From<Y>> Moment<'_, Z, Y, X>
 where
     Add: Op<X>,
 {
@@ -274,8 +279,15 @@ where
         let line = |y: usize| &self.plane[y * job.pitch..][..job.pitch];
         let old = if y == 0 { &[] } else { line(y - 1) };
         slide_rows(level, line(y + job.window[1] - 1), old, self.row);
-        widen(level, self.row, self.wide);
-        lines::tree_sum(level, self.wide, job.window[2], 1, self.out, self.work);
+        let (w, n) = (job.window[2], job.tile[1]);
+        let same = size_of::<Y>() == size_of::<X>();
+        if !same {
+            widen(level, self.row, self.wide);
+        }
+        let from = if same { bits::<X, Y>(self.row) } else { &*self.wide };
+        if !X::windows(level, from, w, n, self.out, self.work) {
+            lines::tree_sum(level, from, w, 1, &mut self.out[..n], self.work);
+        }
     }
 }
 
@@ -301,12 +313,13 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let k = needs.extremes as usize;
     let lo = cut::<T>(bytes, k * job.batch * job.plane());
     let hi = cut::<T>(bytes, k * job.batch * job.plane());
-    let row_lo = cut::<T>(bytes, k * job.rows * job.pitch);
-    let row_hi = cut::<T>(bytes, k * job.rows * job.pitch);
+    let row_lo = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
+    let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let work = cut::<T>(bytes, k * 2 * job.pitch);
     let deep = cut::<T>(bytes, k * deep_len(job));
-    let out_lo = cut::<T>(bytes, k * job.tile[1]);
-    let out_hi = cut::<T>(bytes, k * job.tile[1]);
+    let out_lo = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let out_hi = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let stage = cut::<T>(bytes, k * Stage::len(job, size_of::<T>()));
     let mut s1 = Moment::<Z1, Y1, X1>::cut(job, needs.mean, bytes);
     let mut s2 = Moment::<Z2, Y2, X2>::cut(job, needs.variance, bytes);
     let mut count = Moment::<u32, u32, u32>::cut(job, M, bytes);
@@ -355,7 +368,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
         }
         for z0 in (0..job.dst[0]).step_by(job.batch) {
             if needs.extremes {
-                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep);
+                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep, stage);
             }
             for z in z0..(z0 + job.batch).min(job.dst[0]) {
                 let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
@@ -381,8 +394,8 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                         }
                         let line = (j % job.rows) * job.pitch;
                         let w = job.window[2];
-                        lines::tree_extreme(level, Lo, &row_lo[line..line + job.pitch], w, 1, out_lo, work);
-                        lines::tree_extreme(level, Hi, &row_hi[line..line + job.pitch], w, 1, out_hi, work);
+                        let n = job.tile[1];
+                        lines::row_extremes(level, &row_lo[line..], &row_hi[line..], w, n, out_lo, out_hi, work);
                     }
                     if needs.mean {
                         s1.finish_row(level, job, j);
@@ -420,7 +433,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
 
 /// Extremes over z of a batch of output planes, straight from `src`.
 #[allow(clippy::too_many_arguments)]
-fn planes_extremes<T: Code, const M: bool>(
+fn planes_extremes<T: Code + Plain, const M: bool>(
     level: Level,
     job: &Job,
     tile: &Tile,
@@ -430,22 +443,19 @@ fn planes_extremes<T: Code, const M: bool>(
     lo: &mut [T],
     hi: &mut [T],
     work: &mut [T],
+    buffer: &mut [T],
 ) {
     let cols = tile.cols.1 - tile.cols.0;
+    let stage = Stage::new(job, size_of::<T>(), z0);
     for j in tile.rows.0..tile.rows.1 {
-        let lines = Lines {
-            base: (tile.rows.2 + j - tile.rows.0) * src.row + tile.cols.2,
-            pitch: src.plane,
-            first: (job.at[0] + z0) as isize - job.radius[0] as isize,
-            clip: (0, job.src[0] as isize),
-        };
+        let (from, lines) = stage.fill(tile, src, j, buffer);
         let out = (tile.span(job, j).start, job.plane());
         blocked(
             level,
             (job.batch, job.block),
             Masked::<M>,
             Sources::<false>,
-            [src.data; 2],
+            [from; 2],
             lines,
             job.window[0],
             cols,

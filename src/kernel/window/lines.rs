@@ -3,6 +3,7 @@
 //! Every pass is a flat loop over contiguous elements. A window of `w` lines that lie `step` elements apart is the same
 //! loop for any axis: `step` is 1 along x and the pitch of a row along y.
 
+use super::along::RowExtremes;
 use crate::grid::Voxel;
 
 /// Zero-sized argument that carries a block length to a multiversioned function.
@@ -18,7 +19,7 @@ pub struct Masked<const M: bool>;
 pub struct Sources<const TWO: bool>;
 
 /// An element with an order: integer codes (signed types are mapped by their sign bit) and floats.
-pub trait Elem: Voxel {
+pub trait Elem: Voxel + RowExtremes {
     /// 64 bytes of elements.
     type Chunk: Copy + AsRef<[Self]> + AsMut<[Self]>;
     const CHUNK: Self::Chunk;
@@ -165,9 +166,18 @@ fn extremes_inner<T: Elem, const B: usize, const M: bool, const TWO: bool>(
         }
         return;
     }
+    // Lines beyond the clip repeat the nearest, so the lines common to all windows are one run.
+    let (left, right): ([usize; B], [usize; B]) =
+        (std::array::from_fn(|k| lines.start(k)), std::array::from_fn(|k| lines.start(w - 1 + k)));
+    let core = lines.start(B - 1);
+    let ends = Ends::<B> { left, right, core: (core, 1 + (right[0] - core) / lines.pitch.max(1)), pitch: lines.pitch };
+    let most = ends.right[B - 1] + cols; // starts grow with the line
+    assert!(w >= B && most <= src[0].len() && most <= src[1].len());
+    assert!(out.0 + (B - 1) * out.1 + cols <= lo.len().min(hi.len()));
     let mut x = 0;
     loop {
-        extremes_chunk::<T, B, M, TWO>(src, lines, x, w, coding, lo, hi, out);
+        // SAFETY: every start is at most the last, which was checked with `cols`, and `x + chunk <= cols`.
+        unsafe { extremes_chunk::<T, B, M, TWO>(src, &ends, x, coding, lo, hi, out) };
         if x + chunk >= cols {
             break;
         }
@@ -175,17 +185,31 @@ fn extremes_inner<T: Elem, const B: usize, const M: bool, const TWO: bool>(
     }
 }
 
+/// Where the lines of a block of windows start: those before the common ones, those after (`right[0]` is the last
+/// common one), the first common one and how many there are.
+struct Ends<const B: usize> {
+    left: [usize; B],
+    right: [usize; B],
+    core: (usize, usize),
+    pitch: usize,
+}
+
 /// Joins line `start` of `src` to running extremes.
+///
+/// # Safety
+/// A chunk from `start` on lies in both sources.
 #[inline(always)]
-fn join_line<T: Elem, const M: bool, const TWO: bool>(
+unsafe fn join_line<T: Elem, const M: bool, const TWO: bool>(
     (mut lo, mut hi): (T::Chunk, T::Chunk),
     src: [&[T]; 2],
     start: usize,
     coding: Coding<T>,
 ) -> (T::Chunk, T::Chunk) {
     let chunk = T::CHUNK.as_ref().len();
-    let one = &src[0][start..start + chunk];
-    let two = if TWO { &src[1][start..start + chunk] } else { one };
+    // SAFETY: the caller's promise.
+    let (one, two) =
+        unsafe { (src[0].get_unchecked(start..start + chunk), src[1].get_unchecked(start..start + chunk)) };
+    let two = if TWO { two } else { one };
     let (l, h) = (lo.as_mut(), hi.as_mut());
     for i in 0..chunk {
         let v = one[i].code(coding.flip);
@@ -197,13 +221,16 @@ fn join_line<T: Elem, const M: bool, const TWO: bool>(
     (lo, hi)
 }
 
+/// One chunk of columns at `x`. The chains are written out: as loops they stay in memory, and each step waits for the
+/// store before it (2-core Zen 4 VM, AVX-512, 2026-11-23: cdf_power of u8, r=10, OLD ns/voxel, now NEW).
+///
+/// # Safety
+/// Every start of `ends` and `x` leave room for a chunk in both sources; so does every output line in `lo` and `hi`.
 #[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
+unsafe fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
     src: [&[T]; 2],
-    lines: Lines,
+    ends: &Ends<B>,
     x: usize,
-    w: usize,
     coding: Coding<T>,
     lo: &mut [T],
     hi: &mut [T],
@@ -213,26 +240,44 @@ fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool>(
     let mut nothing = (T::CHUNK, T::CHUNK);
     nothing.0.as_mut().fill(T::GREATEST);
     nothing.1.as_mut().fill(T::LEAST);
+    let join = |m, start: usize| {
+        // SAFETY: the caller's promise.
+        unsafe { join_line::<T, M, TWO>(m, src, start + x, coding) }
+    };
+    let mut put = |k: usize, left: &(T::Chunk, T::Chunk), right: &(T::Chunk, T::Chunk)| {
+        let start = out.0 + k * out.1 + x;
+        // SAFETY: the caller's promise.
+        let (to_lo, to_hi) =
+            unsafe { (lo.get_unchecked_mut(start..start + chunk), hi.get_unchecked_mut(start..start + chunk)) };
+        for i in 0..chunk {
+            to_lo[i] = left.0.as_ref()[i].lo(right.0.as_ref()[i]);
+            to_hi[i] = left.1.as_ref()[i].hi(right.1.as_ref()[i]);
+        }
+    };
     let mut core = nothing;
-    for i in B - 1..w {
-        core = join_line::<T, M, TWO>(core, src, lines.start(i) + x, coding);
+    for i in 0..ends.core.1 {
+        core = join(core, ends.core.0 + i * ends.pitch);
     }
     let mut left = [core; B];
-    for k in (0..B - 1).rev() {
-        left[k] = join_line::<T, M, TWO>(left[k + 1], src, lines.start(k) + x, coding);
+    macro_rules! chain {
+        ($($k:literal)*) => {$(
+            if $k + 1 < B {
+                left[$k] = join(left[$k + 1], ends.left[$k]);
+            }
+        )*};
     }
+    chain!(6 5 4 3 2 1 0);
+    put(0, &left[0], &nothing);
     let mut right = nothing;
-    for (k, l) in left.iter().enumerate() {
-        if k > 0 {
-            right = join_line::<T, M, TWO>(right, src, lines.start(w + k - 1) + x, coding);
-        }
-        let start = out.0 + k * out.1 + x;
-        let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
-        for i in 0..chunk {
-            to_lo[i] = l.0.as_ref()[i].lo(right.0.as_ref()[i]);
-            to_hi[i] = l.1.as_ref()[i].hi(right.1.as_ref()[i]);
-        }
+    macro_rules! outputs {
+        ($($k:literal)*) => {$(
+            if $k < B {
+                right = join(right, ends.right[$k]);
+                put($k, &left[$k], &right);
+            }
+        )*};
     }
+    outputs!(1 2 3 4 5 6 7);
 }
 
 /// Windows from which [`deep_extremes`] pays: below, a core of at most 25 lines is joined directly.
@@ -274,6 +319,10 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
     let mut nothing = (T::CHUNK, T::CHUNK);
     nothing.0.as_mut().fill(T::GREATEST);
     nothing.1.as_mut().fill(T::LEAST);
+    let most = lines.start(8 * blocks + w - 2) + cols;
+    assert!(cols >= chunk && most <= src[0].len() && most <= src[1].len());
+    // SAFETY: starts grow with the line, and the last was checked with `cols >= x + chunk`.
+    let join = |m, start: usize| unsafe { join_line::<T, M, TWO>(m, src, start, coding) };
     // Whole groups that all windows of a block hold: lines 8..8 + 8 groups of the block.
     let groups = (w - 8) / 8;
     let steps = cols.div_ceil(chunk);
@@ -282,7 +331,7 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
             let x = (s * chunk).min(cols - chunk);
             let mut m = nothing;
             for i in 8 * g..8 * g + 8 {
-                m = join_line::<T, M, TWO>(m, src, lines.start(i) + x, coding);
+                m = join(m, lines.start(i) + x);
             }
             work[2 * g * cols + x..][..chunk].copy_from_slice(m.0.as_ref());
             work[(2 * g + 1) * cols + x..][..chunk].copy_from_slice(m.1.as_ref());
@@ -301,15 +350,15 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
             }
             let mut left = [core; 9];
             for k in (0..8).rev() {
-                left[k] = join_line::<T, M, TWO>(left[k + 1], src, lines.start(8 * q + k) + x, coding);
+                left[k] = join(left[k + 1], lines.start(8 * q + k) + x);
             }
             let mut right = nothing;
             for i in 8 + 8 * groups..w {
-                right = join_line::<T, M, TWO>(right, src, lines.start(8 * q + i) + x, coding);
+                right = join(right, lines.start(8 * q + i) + x);
             }
             for (k, l) in left[..8].iter().enumerate() {
                 if k > 0 {
-                    right = join_line::<T, M, TWO>(right, src, lines.start(8 * q + w + k - 1) + x, coding);
+                    right = join(right, lines.start(8 * q + w + k - 1) + x);
                 }
                 let start = out.0 + (8 * q + k) * out.1 + x;
                 let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
@@ -379,12 +428,12 @@ fn join_k<E: Copy, O: Op<E>, const K: usize>(src: &[E], offsets: &[usize], out: 
     } else {
         for i in 0..n {
             // SAFETY: as above.
-            let mut s = unsafe { *t[0].get_unchecked(i) };
-            for a in &t[1..] {
-                // SAFETY: as above.
-                s = O::join(s, unsafe { *a.get_unchecked(i) });
-            }
-            out[i] = s;
+            let e: [E; K] = std::array::from_fn(|k| unsafe { *t[k].get_unchecked(i) });
+            out[i] = if K == 4 {
+                O::join(O::join(e[0], e[1]), O::join(e[2 % K], e[3 % K])) // the order of `columns`
+            } else {
+                e[1..].iter().fold(e[0], |s, v| O::join(s, *v))
+            };
         }
     }
 }
@@ -417,6 +466,24 @@ pub fn tree_extreme<E: Elem, O: Op<E>>(
         *o = (j * size).min(w - size) * step;
     }
     join_at(level, op, if levels == 0 { src } else { &*b }, &offsets[..terms], out, false);
+}
+
+/// Extremes along x of a row, for `n` outputs of windows of `w`: in registers, or by the tree.
+#[allow(clippy::too_many_arguments)]
+pub fn row_extremes<E: Elem>(
+    level: crate::kernel::simd::Level,
+    lo: &[E],
+    hi: &[E],
+    w: usize,
+    n: usize,
+    out_lo: &mut [E],
+    out_hi: &mut [E],
+    work: &mut [E],
+) {
+    if !E::windows(level, lo, hi, w, n, out_lo, out_hi) {
+        tree_extreme(level, Lo, &lo[..n + w - 1], w, 1, &mut out_lo[..n], work);
+        tree_extreme(level, Hi, &hi[..n + w - 1], w, 1, &mut out_hi[..n], work);
+    }
 }
 
 /// Window sums by the radix-4 tree: `out[i]` of `src[i + j * step]`, `j < w`, in an order that depends on `w` alone.

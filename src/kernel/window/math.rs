@@ -38,9 +38,14 @@ fn log2_ratio(f: f32) -> f32 {
 /// has without cancellation. Absolute error at most 1e-6 for every beta.
 #[inline(always)]
 pub fn power(a: f32, b: f32, range: f32, beta: f32) -> f32 {
-    const TWO_THIRDS: u32 = 0x3f2a_aaab;
     let near = 3.0 * b < range;
-    let q = if near { -b } else { a } / range;
+    power_of(if near { -b } else { a } / range, near, beta)
+}
+
+/// `t^beta` from `q = t`, or where `near` from `q = t - 1` in (-1/3, 0].
+#[inline(always)]
+pub fn power_of(q: f32, near: bool, beta: f32) -> f32 {
+    const TWO_THIRDS: u32 = 0x3f2a_aaab;
     let bits = q.to_bits().wrapping_sub(TWO_THIRDS);
     let exponent = ((bits as i32) >> 23) as f32;
     let mantissa = f32::from_bits((bits & 0x7f_ffff) + TWO_THIRDS) - 1.0;

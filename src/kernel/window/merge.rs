@@ -4,12 +4,13 @@
 //! `M2 = sum M2_k + sum (S_k - n_k S/n)^2 / n_k`. Nothing large is subtracted but means of neighbours, so a step of
 //! 1e6 elsewhere in the tile, or in the window, costs no accuracy. The tree is that of [`super::lines`].
 
+use super::columns::Columns;
 use super::lines::{self, Add, Op, level_len, tree_levels};
 use super::plan::Plain;
 use crate::kernel::simd::Level;
 
 /// Sum of f32 (f64) or of f64 (an unevaluated pair of f64).
-pub trait Sum: Plain + Default + std::fmt::Debug {
+pub trait Sum: Plain + Default + std::fmt::Debug + Columns<Self> {
     fn of(v: f64) -> Self;
     fn plus(self, o: Self) -> Self;
     /// Mean for merging, with `inv` = 1/n (0 for n = 0).
@@ -166,6 +167,11 @@ pub struct Wanted {
     pub variance: bool,
     /// Counts per voxel, because some are missing.
     pub counts: bool,
+}
+
+impl Wanted {
+    /// Sums alone.
+    pub const SUMS: Wanted = Wanted { variance: false, counts: false };
 }
 
 /// What [`Moments`] holds, for reading.
@@ -373,6 +379,11 @@ fn merge_k<A: Sum, const K: usize, const ONTO: bool>(
             } else {
                 (sum, total, square) = (sum.plus(s), total + n, square + m);
             }
+        }
+        if K == 4 && !ONTO {
+            // SAFETY: as above.
+            let e: [A; K] = std::array::from_fn(|k| unsafe { *s.get_unchecked(at[k] + x) });
+            sum = e[0].plus(e[1]).plus(e[2 % K].plus(e[3 % K])); // the order of sums alone
         }
         let i = 1.0 / total;
         let i = if total > 0.0 { i } else { 0.0 };

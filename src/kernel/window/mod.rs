@@ -9,9 +9,12 @@ use super::Context;
 use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{WindowChannel, WindowParams};
 
+mod along;
 mod beta;
+mod columns;
 mod emit;
 mod estimate;
+pub mod finish;
 mod float;
 mod float_estimate;
 mod int;
@@ -27,7 +30,8 @@ mod tests;
 
 use emit::Emit;
 use int::Dispatch;
-use plan::{Job, Needs, Plain};
+pub use plan::Needs;
+use plan::{Job, Plain};
 
 /// One requested result. Its element type must be: for `Min` and `Max` the input's type where the affine is the identity,
 /// else `src.dtype().result()`; for everything else `src.dtype().result()`. An `Openness` may also ask for `u8` where
@@ -105,7 +109,7 @@ fn check(src: AnyView, params: &WindowParams, at: [usize; 3], dst: Shape, outs: 
 }
 
 /// Integer volumes of type `S` as unsigned codes `C`: stored bits XOR `flip`.
-fn integers<S: Voxel, C: Dispatch>(
+fn integers<S: Voxel + Plain, C: Dispatch>(
     src: View<S>,
     flip: C,
     params: &WindowParams,
@@ -125,17 +129,10 @@ fn integers<S: Voxel, C: Dispatch>(
     let mut bytes = cx.scratch.take(Emit::bytes(job.tile[1]) + C::bytes(&job, missing.is_some()));
     let mut emit = Emit::new(outs, params, cx.level, job.tile[1], &mut bytes);
     let setup = int::Setup { job: &job, level: cx.level, flip, missing };
-    let view = View { data: bits::<C, S>(src.data), shape: src.shape, plane: src.plane, row: src.row };
+    let view = View { data: plan::bits::<C, S>(src.data), shape: src.shape, plane: src.plane, row: src.row };
     C::run(view, &setup, &mut emit, bytes);
 }
 
 fn code_of<C: Dispatch>(code: f64) -> C {
     C::from_f64(code)
-}
-
-/// The same numbers as another type of the same size.
-fn bits<T: Plain, U: Voxel>(data: &[U]) -> &[T] {
-    assert_eq!(size_of::<T>(), size_of::<U>(), "types of one size");
-    // SAFETY: equal size (asserted) and alignment (primitive numbers), and every bit pattern is a value of both.
-    unsafe { std::slice::from_raw_parts(data.as_ptr().cast(), data.len()) }
 }

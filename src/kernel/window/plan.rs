@@ -1,7 +1,7 @@
 //! Which moments a set of channels needs, how a call is cut into tiles, and how its scratch is laid out.
 
-use super::lines::DEEP;
-use crate::grid::{DType, Shape};
+use super::lines::{DEEP, Lines};
+use crate::grid::{DType, Shape, View};
 use crate::stage::{Method, WindowChannel, WindowParams};
 
 /// Moments to compute.
@@ -124,6 +124,50 @@ fn even(n: usize, most: usize) -> usize {
     n.div_ceil(n.div_ceil(most).max(1)).max(1)
 }
 
+/// The lines of one buffer row that a batch reads along z, copied side by side: planes lie a power of two apart in many
+/// volumes, and then few cache sets hold all of a column. 2-core Zen 4 VM, AVX-512, 2026-11-23, 256 x 256 planes,
+/// cdf_power r=10 in ns/voxel (u8, u16, f32): STAGED, against DIRECT read in place.
+pub struct Stage {
+    /// Planes of `src`, half-open.
+    planes: (usize, usize),
+    first: isize,
+    pitch: usize,
+}
+
+impl Stage {
+    /// For the batch that starts at output plane `z0`.
+    pub fn new(job: &Job, size: usize, z0: usize) -> Stage {
+        let first = (job.at[0] + z0) as isize - job.radius[0] as isize;
+        let end = (first + (job.batch + job.window[0] - 1) as isize).min(job.src[0] as isize);
+        Stage { planes: (first.max(0) as usize, end as usize), first, pitch: Self::pitch(job, size) }
+    }
+
+    /// An odd number of cache lines.
+    fn pitch(job: &Job, size: usize) -> usize {
+        (((job.tile[1] + 2 * job.radius[2]) * size).div_ceil(64) | 1) * 64 / size
+    }
+
+    /// Elements of the buffer: none for windows so long that they are read in place.
+    pub fn len(job: &Job, size: usize) -> usize {
+        if job.window[0] < DEEP { (job.batch + job.window[0] - 1).min(job.src[0]) * Self::pitch(job, size) } else { 0 }
+    }
+
+    /// Copies the lines of buffer row `j` into `buffer`, if it holds them, and says where to read them.
+    pub fn fill<'a, T: Plain>(&self, tile: &Tile, src: View<'a, T>, j: usize, buffer: &'a mut [T]) -> (&'a [T], Lines) {
+        let (y, x) = (tile.rows.2 + j - tile.rows.0, tile.cols.2);
+        if buffer.is_empty() {
+            let clip = (0, src.shape[0] as isize);
+            return (src.data, Lines { base: y * src.row + x, pitch: src.plane, first: self.first, clip });
+        }
+        let cols = tile.cols.1 - tile.cols.0;
+        for (i, z) in (self.planes.0..self.planes.1).enumerate() {
+            buffer[i * self.pitch..][..cols].copy_from_slice(&src.row_at(z, y)[x..x + cols]);
+        }
+        let clip = (0, (self.planes.1 - self.planes.0) as isize);
+        (buffer, Lines { base: 0, pitch: self.pitch, first: self.first - self.planes.0 as isize, clip })
+    }
+}
+
 /// A multiple of 64 elements, odd in 64s: power-of-two pitches would map a column to few cache sets.
 fn odd_lines(n: usize) -> usize {
     (n.div_ceil(64) | 1) * 64
@@ -207,11 +251,18 @@ macro_rules! plain {
         unsafe impl Plain for $t {}
     )*};
 }
-plain!(u8 u16 u32 u64 u128 f32 f64);
+plain!(u8 i8 u16 i16 u32 i32 u64 u128 f32 f64);
 
 /// Bytes per voxel of the moments of a batch of planes.
 pub fn batch_bytes(dtype: DType, needs: Needs) -> usize {
     let size = dtype.size();
     let sums = if dtype.is_float() { 8 * needs.mean as usize + 8 * needs.variance as usize } else { 0 };
     (2 * size * needs.extremes as usize + sums).max(1)
+}
+
+/// The same numbers as another type of the same size. Panics if the sizes differ.
+pub fn bits<T: Plain, U: Plain>(data: &[U]) -> &[T] {
+    assert!(size_of::<T>() == size_of::<U>() && align_of::<T>() <= align_of::<U>(), "types of one size");
+    // SAFETY: equal size and alignment (asserted), and every bit pattern is a value of both.
+    unsafe { std::slice::from_raw_parts(data.as_ptr().cast(), data.len()) }
 }

@@ -1,0 +1,183 @@
+//! Finds an adapter and opens it: Vulkan only, ranked by device type, software refused unless asked for by name.
+
+use std::sync::{Arc, Condvar, Mutex};
+
+use super::facts::{GpuFacts, GpuKind, SLOTS};
+use super::passes::Quantity;
+use super::slot::Slot;
+
+/// An open device with its pipelines and slots. Dropped and opened anew after a failure.
+pub struct Device {
+    pub device: wgpu::Device,
+    pub queue: wgpu::Queue,
+    pub layout: wgpu::BindGroupLayout,
+    /// By [`pipeline_index`].
+    pipelines: Vec<wgpu::ComputePipeline>,
+    slots: Mutex<Vec<Slot>>,
+    idle: Condvar,
+    /// What the driver reported outside of any call's error scopes, and the loss of the device.
+    pub fault: Arc<Mutex<Option<String>>>,
+}
+
+const SHADERS: [(&str, &str); 3] = [
+    ("window_extremes", include_str!("../../shaders/window_extremes.wgsl")),
+    ("window_sums32", include_str!("../../shaders/window_sums32.wgsl")),
+    ("window_sums64", include_str!("../../shaders/window_sums64.wgsl")),
+];
+
+/// Preference; software comes in only when asked for.
+fn rank(kind: wgpu::DeviceType) -> u32 {
+    match kind {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::IntegratedGpu => 1,
+        wgpu::DeviceType::VirtualGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    }
+}
+
+/// The best adapter of this kind, or what was looked for and found.
+fn adapter(kind: GpuKind) -> Result<wgpu::Adapter, String> {
+    // Flags are named rather than taken from the build type, and no variable of the environment changes the choice.
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends: wgpu::Backends::VULKAN,
+        flags: wgpu::InstanceFlags::empty(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    });
+    let all = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
+    let found: Vec<String> =
+        all.iter().map(|a| a.get_info()).map(|i| format!("{} ({:?})", i.name, i.device_type)).collect();
+    let fits = |a: &wgpu::Adapter| {
+        let software = a.get_info().device_type == wgpu::DeviceType::Cpu;
+        software == (kind == GpuKind::Software)
+    };
+    all.into_iter().filter(fits).min_by_key(|a| rank(a.get_info().device_type)).ok_or_else(|| {
+        let wanted = match kind {
+            GpuKind::Hardware => "a Vulkan driver of a hardware GPU",
+            GpuKind::Software => "a Vulkan driver in software, such as lavapipe",
+        };
+        let found = if found.is_empty() { "no Vulkan adapter".to_string() } else { found.join(", ") };
+        format!("looked for {wanted}; found {found}")
+    })
+}
+
+/// Opens a device of this kind.
+pub fn open(kind: GpuKind) -> Result<(Device, GpuFacts), String> {
+    let adapter = adapter(kind)?;
+    let info = adapter.get_info();
+    let limits = adapter.limits();
+    let wanted = wgpu::Limits {
+        max_buffer_size: limits.max_buffer_size,
+        max_storage_buffer_binding_size: limits.max_storage_buffer_binding_size,
+        ..wgpu::Limits::downlevel_defaults()
+    };
+    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+        label: Some("occlude"),
+        required_features: wgpu::Features::empty(),
+        required_limits: wanted,
+        experimental_features: wgpu::ExperimentalFeatures::disabled(),
+        memory_hints: wgpu::MemoryHints::MemoryUsage,
+        trace: wgpu::Trace::Off,
+    }))
+    .map_err(|e| format!("{} cannot be opened: {e}", info.name))?;
+    let fault = Arc::new(Mutex::new(None));
+    let note = |fault: &Arc<Mutex<Option<String>>>| {
+        let fault = fault.clone();
+        move |text: String| {
+            fault.lock().unwrap_or_else(|e| e.into_inner()).get_or_insert(text);
+        }
+    };
+    let (on_error, on_loss) = (note(&fault), note(&fault));
+    device.on_uncaptured_error(Arc::new(move |e| on_error(e.to_string())));
+    device.set_device_lost_callback(move |reason, text| on_loss(format!("device lost ({reason:?}): {text}")));
+    let facts = GpuFacts {
+        name: info.name.clone(),
+        software: info.device_type == wgpu::DeviceType::Cpu,
+        most_bytes: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(1 << 30),
+    };
+    let (layout, pipelines) = pipelines(&device)?;
+    let slots = (0..SLOTS).map(|_| Slot::default()).collect();
+    let (slots, idle) = (Mutex::new(slots), Condvar::new());
+    Ok((Device { device, queue, layout, pipelines, slots, idle, fault }, facts))
+}
+
+fn pipelines(device: &wgpu::Device) -> Result<(wgpu::BindGroupLayout, Vec<wgpu::ComputePipeline>), String> {
+    let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
+    let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
+        binding,
+        visibility: wgpu::ShaderStages::COMPUTE,
+        ty: wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None },
+        count: None,
+    };
+    let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some("pass"),
+        entries: &[
+            entry(0, wgpu::BufferBindingType::Uniform),
+            entry(1, wgpu::BufferBindingType::Storage { read_only: true }),
+            entry(2, wgpu::BufferBindingType::Storage { read_only: false }),
+        ],
+    });
+    let shared = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some("pass"),
+        bind_group_layouts: &[Some(&layout)],
+        immediate_size: 0,
+    });
+    let mut pipelines = Vec::new();
+    for (name, text) in SHADERS {
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(name),
+            source: wgpu::ShaderSource::Wgsl(text.into()),
+        });
+        for entry in ["first", "next"] {
+            pipelines.push(device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(name),
+                layout: Some(&shared),
+                module: &module,
+                entry_point: Some(entry),
+                compilation_options: wgpu::PipelineCompilationOptions::default(),
+                cache: None,
+            }));
+        }
+    }
+    match pollster::block_on(scope.pop()) {
+        Some(error) => Err(format!("a shader was refused: {error}")),
+        None => Ok((layout, pipelines)),
+    }
+}
+
+impl Device {
+    /// The pipeline of pass `axis` of a quantity.
+    pub fn pipeline(&self, quantity: Quantity, axis: usize) -> &wgpu::ComputePipeline {
+        let shader = match quantity {
+            Quantity::Extremes => 0,
+            Quantity::Sum { wide: false, .. } => 1,
+            Quantity::Sum { wide: true, .. } => 2,
+        };
+        &self.pipelines[2 * shader + (axis > 0) as usize]
+    }
+
+    /// Waits for a free slot.
+    pub fn take_slot(&self) -> SlotGuard<'_> {
+        let mut slots = self.slots.lock().unwrap_or_else(|e| e.into_inner());
+        loop {
+            if let Some(slot) = slots.pop() {
+                return SlotGuard { device: self, slot };
+            }
+            slots = self.idle.wait(slots).unwrap_or_else(|e| e.into_inner());
+        }
+    }
+}
+
+/// A slot that goes back when it is dropped, whatever happened.
+pub struct SlotGuard<'a> {
+    device: &'a Device,
+    pub slot: Slot,
+}
+
+impl Drop for SlotGuard<'_> {
+    fn drop(&mut self) {
+        let slot = std::mem::take(&mut self.slot);
+        self.device.slots.lock().unwrap_or_else(|e| e.into_inner()).push(slot);
+        self.device.idle.notify_one();
+    }
+}

@@ -1,0 +1,53 @@
+//! What the planner knows about a GPU, and which windows have kernels there. No wgpu here.
+
+use crate::grid::DType;
+use crate::stage::{Method, WindowChannel};
+
+/// Which adapters may be opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GpuKind {
+    /// Anything but software.
+    Hardware,
+    /// A software adapter (lavapipe, SwiftShader): slow, right, for tests.
+    Software,
+}
+
+/// An adapter as the planner sees it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GpuFacts {
+    pub name: String,
+    /// Device memory is this process's memory.
+    pub software: bool,
+    /// Most bytes of one buffer that a shader can see.
+    pub most_bytes: u64,
+}
+
+/// Why exact openness stays on the CPU.
+pub const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
+
+/// Bricks that are on the GPU at once: one computes while the host copies for the other.
+pub const SLOTS: u64 = 2;
+
+impl GpuFacts {
+    /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to seven buffers' worth
+    /// per slot) and a dispatch stays short. Larger boxes are cut.
+    pub fn buffer_cap(&self, memory: u64) -> u64 {
+        self.most_bytes.min((memory / 32).clamp(256 << 10, 256 << 20))
+    }
+}
+
+/// Whether windows of this type have a GPU kernel, or why not.
+pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result<(), &'static str> {
+    if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Exact, _))) {
+        return Err(EXACT);
+    }
+    match dtype {
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
+            Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
+        }
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 => Ok(()),
+        DType::U32 | DType::I32 => Err("no GPU kernel that sums 32-bit integers exactly: runs on the CPU"),
+        DType::F32 => Err("no GPU kernel that holds SPEC 5.6 for f32: runs on the CPU"),
+        DType::F64 => Err("no GPU kernel that holds SPEC 5.6 for f64: runs on the CPU"),
+    }
+}

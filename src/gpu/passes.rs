@@ -1,0 +1,314 @@
+//! How a call is cut into parts that fit the device, how many bytes a part takes, and the three passes of each quantity.
+//! Pure arithmetic, shared by planner and engine.
+
+use crate::grid::{DType, Shape};
+use crate::kernel::window::Needs;
+
+/// Bytes between the parameters of passes in their buffer (the largest alignment that an adapter may ask for).
+pub const PASS_STRIDE: u64 = 256;
+/// Most passes of a part: three axes of three quantities.
+pub const MOST_PASSES: u64 = 9;
+/// Threads of a workgroup; in every shader.
+pub const GROUP: u32 = 64;
+
+/// What one dispatch does; the shaders' `struct Pass`, which explains the fields.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Pass {
+    pub n: u32,
+    pub m: u32,
+    pub first: i32,
+    pub window: u32,
+    pub in_axis: u32,
+    pub in_i: u32,
+    pub in_j: u32,
+    pub out_axis: u32,
+    pub out_i: u32,
+    pub out_j: u32,
+    pub lines: u32,
+    pub blocks: u32,
+    pub block: u32,
+    pub along: u32,
+    pub shift: u32,
+    pub flip: u32,
+    pub square: u32,
+    pub threads: u32,
+    pub spare: [u32; 2],
+}
+
+/// A quantity that the device makes for every window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quantity {
+    Extremes,
+    /// Sums of codes or of squares, `wide` as pairs of u32.
+    Sum {
+        square: bool,
+        wide: bool,
+    },
+}
+
+impl Quantity {
+    /// Bytes per window.
+    pub fn bytes(self) -> u64 {
+        match self {
+            Quantity::Sum { wide: true, .. } => 8,
+            _ => 4,
+        }
+    }
+}
+
+/// One call, all extents `[z, y, x]`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Job {
+    pub src: Shape,
+    pub dst: Shape,
+    pub at: [usize; 3],
+    /// At most the extent of `src` less one: a larger radius changes no window.
+    pub radius: [usize; 3],
+    /// Bytes of a voxel: 1 or 2.
+    pub voxel: usize,
+    /// Stored as two's complement.
+    pub signed: bool,
+    pub needs: Needs,
+}
+
+/// A box of the outputs and the voxels that its windows see.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Part {
+    /// First output voxel, extent.
+    pub lo: [usize; 3],
+    pub dst: Shape,
+    /// First voxel of `src`, extent.
+    pub from: [usize; 3],
+    pub src: Shape,
+}
+
+/// Bytes of the buffers of a slot.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Sizes {
+    /// Packed voxels.
+    pub source: u64,
+    /// After z (and x again), and after y.
+    pub a: u64,
+    pub b: u64,
+    /// Everything that comes back.
+    pub read: u64,
+}
+
+impl Sizes {
+    pub fn max(self, o: Sizes) -> Sizes {
+        Sizes { source: self.source.max(o.source), a: self.a.max(o.a), b: self.b.max(o.b), read: self.read.max(o.read) }
+    }
+
+    fn largest(self) -> u64 {
+        self.source.max(self.a).max(self.b).max(self.read)
+    }
+
+    /// Bytes of the upload buffer: parameters, then voxels.
+    pub fn upload(self) -> u64 {
+        MOST_PASSES * PASS_STRIDE + self.source
+    }
+
+    /// Bytes of host memory that a slot takes: staging, and on a software adapter everything.
+    pub fn host_bytes(self, software: bool) -> u64 {
+        let device = if software { MOST_PASSES * PASS_STRIDE + self.source + self.a + self.b } else { 0 };
+        self.upload() + self.read + device
+    }
+}
+
+impl Job {
+    /// `None` if voxels of this type have no kernel here, or the windows could hold 2^31 voxels.
+    pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], radius: [usize; 3], needs: Needs) -> Option<Job> {
+        let (voxel, signed) = match dtype {
+            DType::U8 => (1, false),
+            DType::I8 => (1, true),
+            DType::U16 => (2, false),
+            DType::I16 => (2, true),
+            _ => return None,
+        };
+        let radius = std::array::from_fn(|a| radius[a].min(src[a].saturating_sub(1)));
+        let job = Job { src, dst, at, radius, voxel, signed, needs };
+        (job.count() < 1 << 31).then_some(job)
+    }
+
+    /// Most voxels of a window.
+    fn count(&self) -> u64 {
+        (0..3).map(|a| (2 * self.radius[a] + 1).min(self.src[a]) as u64).product()
+    }
+
+    /// What the device makes, with the widths that hold it: a sum of n codes up to T fits 32 bits where n T < 2^32.
+    pub fn quantities(&self) -> Vec<Quantity> {
+        let top = (1u128 << (8 * self.voxel)) - 1;
+        let wide = |most: u128| self.count() as u128 * most >= 1 << 32;
+        let mut list = Vec::new();
+        if self.needs.extremes {
+            list.push(Quantity::Extremes);
+        }
+        if self.needs.mean {
+            list.push(Quantity::Sum { square: false, wide: wide(top) });
+        }
+        if self.needs.variance {
+            // Squares are never narrower than the sums, since n T^2 >= n T.
+            list.push(Quantity::Sum { square: true, wide: wide(top * top) });
+        }
+        list
+    }
+
+    fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
+        let from: [usize; 3] = std::array::from_fn(|a| (self.at[a] + lo[a]).saturating_sub(self.radius[a]));
+        let to = |a: usize| (self.at[a] + lo[a] + dst[a] + self.radius[a]).min(self.src[a]);
+        Part { lo, dst, from, src: std::array::from_fn(|a| to(a) - from[a]) }
+    }
+
+    /// Voxels per packed row, a whole number of words.
+    pub fn pitch(&self, part: &Part) -> usize {
+        part.src[2].next_multiple_of(4 / self.voxel)
+    }
+
+    pub fn sizes(&self, part: &Part) -> Sizes {
+        let quantities = self.quantities();
+        let element = quantities.iter().map(|q| q.bytes()).max().unwrap_or(4);
+        let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
+        let ([nz, ny, nx], [mz, my, _]) = (part.src, part.dst);
+        // Multiples of 256: a slot's buffers then serve bricks that differ by a few voxels, and copies are aligned.
+        let up = |n: u64| n.next_multiple_of(256).max(256);
+        Sizes {
+            source: up(product([nz, ny, self.pitch(part)]) * self.voxel as u64),
+            a: up(product([mz, ny, nx]) * element),
+            b: up(product([mz, my, nx]) * element),
+            read: quantities.iter().map(|q| up(product(part.dst) * q.bytes())).sum::<u64>().max(256),
+        }
+    }
+
+    /// Parts of which every buffer is at most `cap` bytes: halves along z first, since cuts there keep rows whole and cost
+    /// least. `None` where even one voxel's windows do not fit.
+    pub fn parts(&self, cap: u64) -> Option<Vec<Part>> {
+        let mut open = vec![([0; 3], self.dst)];
+        let mut parts = Vec::new();
+        while let Some((lo, shape)) = open.pop() {
+            let part = self.part(lo, shape);
+            if self.sizes(&part).largest() <= cap {
+                parts.push(part);
+                continue;
+            }
+            let axis = (0..3).find(|&a| shape[a] > 1)?;
+            let half = shape[axis] / 2;
+            let (mut low, mut high, mut middle) = (shape, shape, lo);
+            low[axis] = half;
+            high[axis] -= half;
+            middle[axis] += half;
+            open.push((middle, high));
+            open.push((lo, low));
+        }
+        Some(parts)
+    }
+
+    /// Largest buffers of any part.
+    pub fn slot(&self, cap: u64) -> Sizes {
+        let parts = self.parts(cap).unwrap_or_default();
+        parts.iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
+    }
+
+    /// The passes of one quantity over a part: z from packed voxels, then y, then x.
+    pub fn passes(&self, part: &Part, quantity: Quantity) -> [Pass; 3] {
+        let ([nz, ny, nx], [mz, my, mx]) = (part.src.map(|n| n as u32), part.dst.map(|n| n as u32));
+        let pitch = self.pitch(part) as u32;
+        let axis = |a: usize| {
+            let window = 2 * self.radius[a] as u32 + 1;
+            let (n, m) = (part.src[a] as u32, part.dst[a] as u32);
+            let block = if quantity == Quantity::Extremes { window } else { window.max(32) };
+            let start = (self.at[a] + part.lo[a]) as i64 - self.radius[a] as i64 - part.from[a] as i64;
+            Pass { n, m, first: start as i32, window, blocks: m.div_ceil(block), block, ..Pass::default() }
+        };
+        let z = Pass {
+            in_axis: ny * pitch,
+            in_i: 1,
+            in_j: pitch,
+            out_axis: ny * nx,
+            out_i: 1,
+            out_j: nx,
+            lines: nx,
+            shift: if self.voxel == 1 { 2 } else { 1 },
+            flip: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
+            square: matches!(quantity, Quantity::Sum { square: true, .. }) as u32,
+            ..axis(0)
+        };
+        let y =
+            Pass { in_axis: nx, in_i: 1, in_j: ny * nx, out_axis: nx, out_i: 1, out_j: my * nx, lines: nx, ..axis(1) };
+        let x = Pass {
+            in_axis: 1,
+            in_i: nx,
+            in_j: my * nx,
+            out_axis: 1,
+            out_i: mx,
+            out_j: my * mx,
+            lines: my,
+            along: 1,
+            ..axis(2)
+        };
+        debug_assert!(nz > 0 && mz > 0);
+        let threads = |p: Pass, lines: u32| Pass { threads: p.blocks * p.lines * lines, ..p };
+        [threads(z, ny), threads(y, mz), threads(x, mz)]
+    }
+}
+
+/// Workgroups of a pass over x and y: no axis may exceed 65535.
+pub fn groups(pass: &Pass) -> [u32; 2] {
+    let all = pass.threads.div_ceil(GROUP).max(1);
+    let x = all.min(65535);
+    [x, all.div_ceil(x)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn job(dtype: DType, radius: usize) -> Job {
+        let needs = Needs { extremes: true, mean: true, variance: true, float: false };
+        Job::new(dtype, [40, 30, 50], [20, 30, 40], [10, 0, 5], [radius; 3], needs).unwrap()
+    }
+
+    #[test]
+    fn parts_tile_the_outputs_and_see_their_windows() {
+        let job = job(DType::U16, 4);
+        for cap in [1 << 30, 200_000, 20_000, 9_000] {
+            let parts = job.parts(cap).unwrap();
+            assert_eq!(parts.len() == 1, cap == 1 << 30);
+            let voxels: usize = parts.iter().map(|p| p.dst.iter().product::<usize>()).sum();
+            assert_eq!(voxels, job.dst.iter().product::<usize>());
+            for p in &parts {
+                assert!(job.sizes(p).largest() <= cap);
+                for a in 0..3 {
+                    let c = job.at[a] + p.lo[a];
+                    assert_eq!(p.from[a], c.saturating_sub(4));
+                    assert_eq!(p.from[a] + p.src[a], (c + p.dst[a] + 4).min(job.src[a]));
+                }
+            }
+        }
+        assert!(job.parts(300).is_none());
+    }
+
+    #[test]
+    fn sums_get_the_bits_that_they_need() {
+        let wide = |dtype, radius| {
+            let list = job(dtype, radius).quantities();
+            list.iter().map(|q| q.bytes()).collect::<Vec<_>>()
+        };
+        assert_eq!(wide(DType::U8, 10), [4, 4, 4]);
+        assert_eq!(wide(DType::U8, 60), [4, 4, 4]); // 60000 voxels of 255^2
+        assert_eq!(wide(DType::I16, 2), [4, 4, 8]);
+        let needs = Needs { extremes: false, mean: true, variance: true, float: false };
+        let far = Job::new(DType::U16, [60; 3], [60; 3], [0; 3], [60; 3], needs).unwrap();
+        assert_eq!(far.quantities().iter().map(|q| q.bytes()).collect::<Vec<_>>(), [8, 8]);
+        assert!(Job::new(DType::F32, [60; 3], [60; 3], [0; 3], [60; 3], needs).is_none());
+        assert!(Job::new(DType::U8, [1300; 3], [9; 3], [0; 3], [2000; 3], needs).is_none());
+    }
+
+    #[test]
+    fn groups_cover_all_threads_within_the_limit() {
+        for threads in [1, 64, 65, 65535 * 64, 65535 * 64 + 1, u32::MAX - 64] {
+            let [x, y] = groups(&Pass { threads, ..Pass::default() });
+            assert!(x <= 65535 && y <= 65535 && x as u64 * y as u64 * 64 >= threads as u64);
+        }
+    }
+}

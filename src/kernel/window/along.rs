@@ -1,0 +1,273 @@
+//! Windows along a row with AVX-512: extremes by doubling in registers (two-source permutes shift a vector into its
+//! neighbour), exact sums as differences of running sums. Other levels use the trees of [`super::lines`], which give the
+//! same bits: extremes do not depend on an order, and integer sums wrap.
+
+use crate::kernel::simd::Level;
+
+/// Elements beyond the last result, rounded up to 64, that may be read.
+pub const SLACK: usize = 64;
+
+/// Elements that a source for `n` results must hold.
+pub fn roomy(n: usize) -> usize {
+    n.next_multiple_of(64) + SLACK
+}
+
+/// Element types with extremes in registers.
+pub trait RowExtremes: Sized {
+    /// `out_lo[i]` is the least of `lo[i..i + w]` and `out_hi[i]` the greatest of `hi[i..i + w]` for `i < n`, with
+    /// sources of `roomy(n)` elements and results of `n` rounded up to 64. Returns false, with nothing done, where the level
+    /// or the window asks for the tree.
+    fn windows(
+        _level: Level,
+        _lo: &[Self],
+        _hi: &[Self],
+        _w: usize,
+        _n: usize,
+        _out_lo: &mut [Self],
+        _out_hi: &mut [Self],
+    ) -> bool {
+        false
+    }
+}
+
+/// Sum types with running sums along a row.
+pub trait RowSums: Sized {
+    /// `out[i]` is the sum of `src[i..i + w]`, modulo the type, for `i < n`; `out` holds `n` and `src` `n + w - 1`
+    /// elements, rounded up to 64, `work` 64 more than `src`. Returns false, with nothing done, where the level asks for
+    /// the tree.
+    fn windows(_level: Level, _src: &[Self], _w: usize, _n: usize, _out: &mut [Self], _work: &mut [Self]) -> bool {
+        false
+    }
+}
+
+impl RowExtremes for f64 {}
+impl RowSums for u128 {}
+
+#[cfg(not(target_arch = "x86_64"))]
+mod wide {
+    use super::{RowExtremes, RowSums};
+    impl RowExtremes for u8 {}
+    impl RowExtremes for u16 {}
+    impl RowExtremes for u32 {}
+    impl RowExtremes for f32 {}
+    impl RowSums for u32 {}
+    impl RowSums for u64 {}
+}
+
+#[cfg(target_arch = "x86_64")]
+mod wide {
+    use std::arch::x86_64::*;
+
+    use super::{RowExtremes, RowSums, SLACK, roomy};
+    use crate::kernel::simd::Level;
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    fn min_f32(a: __m512i, b: __m512i) -> __m512i {
+        _mm512_castps_si512(_mm512_min_ps(_mm512_castsi512_ps(a), _mm512_castsi512_ps(b)))
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    fn max_f32(a: __m512i, b: __m512i) -> __m512i {
+        _mm512_castps_si512(_mm512_max_ps(_mm512_castsi512_ps(a), _mm512_castsi512_ps(b)))
+    }
+
+    /// Levels of doubling below `P`: each keeps its vector for the one before.
+    macro_rules! grow {
+        ($p:ident, $shifts:ident, $op:ident, $permute:ident, $a:ident, $right:ident; $($k:literal)*) => {$(
+            if $k < $p {
+                let next = $op($a, $permute($a, $shifts[$k], $right[$k]));
+                $right[$k] = $a;
+                $a = next;
+            }
+        )*};
+    }
+
+    macro_rules! extremes {
+        ($($t:ident, $index:ident, $lanes:literal, $name:ident, $min:ident, $max:ident, $permute:ident;)*) => {$(
+            impl RowExtremes for $t {
+                fn windows(
+                    level: Level,
+                    lo: &[$t],
+                    hi: &[$t],
+                    w: usize,
+                    n: usize,
+                    out_lo: &mut [$t],
+                    out_hi: &mut [$t],
+                ) -> bool {
+                    if level != Level::Avx512 || w == 0 || w >= 2 * $lanes || w > SLACK + 1 {
+                        return false;
+                    }
+                    let (from, to) = (lo.len().min(hi.len()), out_lo.len().min(out_hi.len()));
+                    assert!(roomy(n) <= from && n.next_multiple_of(64) <= to);
+                    // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
+                    unsafe {
+                        match w.ilog2() {
+                            0 => $name::<0>(lo, hi, w, n, out_lo, out_hi),
+                            1 => $name::<1>(lo, hi, w, n, out_lo, out_hi),
+                            2 => $name::<2>(lo, hi, w, n, out_lo, out_hi),
+                            3 => $name::<3>(lo, hi, w, n, out_lo, out_hi),
+                            4 => $name::<4>(lo, hi, w, n, out_lo, out_hi),
+                            5 => $name::<5>(lo, hi, w, n, out_lo, out_hi),
+                            _ => $name::<6>(lo, hi, w, n, out_lo, out_hi),
+                        }
+                    }
+                    true
+                }
+            }
+
+            /// Vectors from the last to the first; each level keeps its vector for the one before.
+            #[target_feature(enable = "avx512f,avx512bw,avx512vbmi")]
+            #[allow(clippy::too_many_arguments)]
+            unsafe fn $name<const P: usize>(
+                lo: &[$t],
+                hi: &[$t],
+                w: usize,
+                n: usize,
+                out_lo: &mut [$t],
+                out_hi: &mut [$t],
+            ) {
+                // Lane j takes lane j + by of a vector and its right neighbour.
+                let shift = |by: usize| {
+                    let lanes: [$index; $lanes] = std::array::from_fn(|j| (j + by) as $index);
+                    // SAFETY: 64 bytes.
+                    unsafe { _mm512_loadu_si512(lanes.as_ptr().cast()) }
+                };
+                let last = shift(w - (1 << P));
+                let shifts: [__m512i; 6] = std::array::from_fn(|k| shift(if k < P { 1 << k } else { 0 }));
+                let vectors = n.div_ceil($lanes);
+                // The last window reaches one vector beyond the last result, or two.
+                let start = vectors + 1 + (w > $lanes + 1) as usize;
+                // SAFETY: `start` vectors are less than `roomy(n)` elements, as the caller checked.
+                let at = |s: &[$t], i: usize| unsafe { _mm512_loadu_si512(s.as_ptr().add(i * $lanes).cast()) };
+                let (mut right_lo, mut right_hi) = ([at(lo, start - 1); 7], [at(hi, start - 1); 7]);
+                for i in (0..start).rev() {
+                    let (mut a, mut b) = (at(lo, i), at(hi, i));
+                    grow!(P, shifts, $min, $permute, a, right_lo; 0 1 2 3 4 5);
+                    grow!(P, shifts, $max, $permute, b, right_hi; 0 1 2 3 4 5);
+                    let (least, most) = ($min(a, $permute(a, last, right_lo[P])), $max(b, $permute(b, last, right_hi[P])));
+                    (right_lo[P], right_hi[P]) = (a, b);
+                    if i < vectors {
+                        // SAFETY: as for reading.
+                        unsafe {
+                            _mm512_storeu_si512(out_lo.as_mut_ptr().add(i * $lanes).cast(), least);
+                            _mm512_storeu_si512(out_hi.as_mut_ptr().add(i * $lanes).cast(), most);
+                        }
+                    }
+                }
+            }
+        )*};
+    }
+    extremes! {
+        u8, u8, 64, extremes_u8, _mm512_min_epu8, _mm512_max_epu8, _mm512_permutex2var_epi8;
+        u16, u16, 32, extremes_u16, _mm512_min_epu16, _mm512_max_epu16, _mm512_permutex2var_epi16;
+        u32, u32, 16, extremes_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
+        f32, u32, 16, extremes_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
+    }
+
+    macro_rules! sums {
+        ($($t:ident, $lanes:literal, $name:ident, $add:ident, $sub:ident, $align:ident, $permute:ident, $set:ident, $($step:literal)*;)*) => {$(
+            impl RowSums for $t {
+                fn windows(level: Level, src: &[$t], w: usize, n: usize, out: &mut [$t], work: &mut [$t]) -> bool {
+                    if level != Level::Avx512 || w == 0 {
+                        return false;
+                    }
+                    let len = (n + w - 1).next_multiple_of(64);
+                    assert!(len <= src.len() && len + 64 <= work.len() && n.next_multiple_of(64) <= out.len());
+                    // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
+                    unsafe { $name(src, w, n, out, work) };
+                    true
+                }
+            }
+
+            /// Running sums from 16 elements on in `work`, then their differences.
+            #[target_feature(enable = "avx512f")]
+            unsafe fn $name(src: &[$t], w: usize, n: usize, out: &mut [$t], work: &mut [$t]) {
+                const LEAD: usize = 16;
+                work[..LEAD].fill(0);
+                let (zero, top) = (_mm512_setzero_si512(), $set($lanes - 1));
+                let mut carry = zero;
+                for i in (0..n + w - 1).step_by($lanes) {
+                    // SAFETY: whole vectors below the length rounded up to 64.
+                    let mut p = unsafe { _mm512_loadu_si512(src.as_ptr().add(i).cast()) };
+                    $(p = $add(p, $align::<{ $lanes - $step }>(p, zero));)*
+                    let sum = $add(p, carry);
+                    carry = $add(carry, $permute(top, p));
+                    // SAFETY: as above, and `LEAD` more.
+                    unsafe { _mm512_storeu_si512(work.as_mut_ptr().add(LEAD + i).cast(), sum) };
+                }
+                for i in (0..n).step_by($lanes) {
+                    // SAFETY: as above; the last vector may read up to 64 elements beyond the sums.
+                    unsafe {
+                        let before = _mm512_loadu_si512(work.as_ptr().add(LEAD + i - 1).cast());
+                        let end = _mm512_loadu_si512(work.as_ptr().add(LEAD + i + w - 1).cast());
+                        _mm512_storeu_si512(out.as_mut_ptr().add(i).cast(), $sub(end, before));
+                    }
+                }
+            }
+        )*};
+    }
+    sums! {
+        u32, 16, sums_u32, _mm512_add_epi32, _mm512_sub_epi32, _mm512_alignr_epi32, _mm512_permutexvar_epi32, _mm512_set1_epi32, 1 2 4 8;
+        u64, 8, sums_u64, _mm512_add_epi64, _mm512_sub_epi64, _mm512_alignr_epi64, _mm512_permutexvar_epi64, _mm512_set1_epi64, 1 2 4;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::window::lines;
+
+    fn numbers<T>(of: impl Fn(u32) -> T, len: usize) -> Vec<T> {
+        (0..len as u32).map(|i| of(i.wrapping_mul(2_654_435_761) >> 3)).collect()
+    }
+
+    fn check_extremes<T: lines::Elem>(of: impl Fn(u32) -> T) {
+        for level in Level::available() {
+            for w in (1..=67).chain([127, 128]) {
+                for n in [1, 15, 63, 64, 65, 130, 256] {
+                    let (a, b) = (numbers(&of, roomy(n) + w), numbers(|i| of(i ^ 0x5a5a_5a5a), roomy(n) + w));
+                    let (mut lo, mut hi) = (vec![T::LEAST; roomy(n)], vec![T::LEAST; roomy(n)]);
+                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi) {
+                        for i in 0..n {
+                            let least = a[i..i + w].iter().fold(T::GREATEST, |m, v| m.lo(*v));
+                            let most = b[i..i + w].iter().fold(T::LEAST, |m, v| m.hi(*v));
+                            assert!(lo[i] == least && hi[i] == most, "{level:?} {w} {n} {i}");
+                        }
+                    } else {
+                        assert!(level < Level::Avx512 || w > 15);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn extremes_in_registers_equal_direct_windows() {
+        check_extremes(|i| (i >> 9) as u8);
+        check_extremes(|i| (i >> 7) as u16);
+        check_extremes(|i| i);
+        check_extremes(|i| i as f32 - 1e8);
+    }
+
+    #[test]
+    fn running_sums_equal_direct_windows() {
+        for level in Level::available() {
+            for w in [1, 2, 3, 8, 15, 16, 17, 21, 64, 129, 401] {
+                for n in [1, 63, 64, 65, 250] {
+                    let len = usize::next_multiple_of(n + w - 1, 64);
+                    let (a, b) = (numbers(|i| i << 3, len), numbers(|i| (i as u64) << 33, len));
+                    let (mut s, mut t) = (vec![1; roomy(n)], vec![1; roomy(n)]);
+                    let done = <u32 as RowSums>::windows(level, &a, w, n, &mut s, &mut vec![7; len + 64]);
+                    assert_eq!(done, <u64 as RowSums>::windows(level, &b, w, n, &mut t, &mut vec![7; len + 64]));
+                    assert_eq!(done, level == Level::Avx512);
+                    for i in 0..n * done as usize {
+                        assert_eq!(s[i], a[i..i + w].iter().fold(0, |s: u32, v| s.wrapping_add(*v)), "{w} {n} {i}");
+                        assert_eq!(t[i], b[i..i + w].iter().fold(0, |s: u64, v| s.wrapping_add(*v)), "{w} {n} {i}");
+                    }
+                }
+            }
+        }
+    }
+}
