@@ -25,6 +25,9 @@ pub struct GpuFacts {
 /// Why exact openness stays on the CPU.
 pub const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
 
+/// Why the beta distribution stays on the CPU.
+pub const BETA: &str = "no GPU kernel for method \"beta\": runs on the CPU";
+
 /// Bricks that are on the GPU at once: one computes while the host copies for the other.
 pub const SLOTS: u64 = 2;
 
@@ -41,6 +44,9 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Exact, _))) {
         return Err(EXACT);
     }
+    if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Beta, _))) {
+        return Err(BETA);
+    }
     match dtype {
         DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
             Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
@@ -49,5 +55,19 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
         DType::U32 | DType::I32 => Err("no GPU kernel that sums 32-bit integers exactly: runs on the CPU"),
         DType::F32 => Err("no GPU kernel that holds SPEC 5.6 for f32: runs on the CPU"),
         DType::F64 => Err("no GPU kernel that holds SPEC 5.6 for f64: runs on the CPU"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stage::Ties;
+
+    #[test]
+    fn estimators_without_a_shader_stay_on_the_cpu() {
+        let open = |method| [WindowChannel::Openness(method, Ties::Le)];
+        assert_eq!(window(DType::U8, false, &open(Method::Beta)), Err(BETA));
+        assert_eq!(window(DType::U8, false, &open(Method::Exact)), Err(EXACT));
+        assert_eq!(window(DType::U8, false, &open(Method::CdfPower)), Ok(()));
     }
 }
