@@ -197,12 +197,17 @@ mod tests {
                         let mut out = vec![7.0; 8 * 45];
                         assert!(<f64 as Columns<f64>>::sums(level, &src, lines, w, 8, cols, &mut out, (3, 45)));
                         for x in 0..cols {
-                            let at = |i: isize| if (clip.0..clip.1).contains(&i) { src[i as usize * 40 + x] } else { 0.0 };
+                            let at =
+                                |i: isize| if (clip.0..clip.1).contains(&i) { src[i as usize * 40 + x] } else { 0.0 };
                             let column: Vec<f64> = (0..w + 7).map(|i| at(first + i as isize)).collect();
                             let (mut s, mut work) = (vec![0.0; 8], vec![0.0; 8 + w]);
                             tree_sum(level, &column, w, 1, &mut s, &mut work);
                             for k in 0..8 {
-                                assert_eq!(out[3 + k * 45 + x].to_bits(), s[k].to_bits(), "{level:?} {w} {cols} {first} {clip:?}");
+                                assert_eq!(
+                                    out[3 + k * 45 + x].to_bits(),
+                                    s[k].to_bits(),
+                                    "{level:?} {w} {cols} {first} {clip:?}"
+                                );
                             }
                         }
                     }

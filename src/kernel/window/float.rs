@@ -1,11 +1,11 @@
 //! Float volumes: extremes exactly, sums and (mean, M2) merges along a tree that depends on the window alone, so that
 //! neither the brick nor a NaN elsewhere in it shows in a single bit.
 
+use super::along::SLACK;
+use super::columns::{self, BLOCK, Columns};
 use super::emit::{Emit, polarity, put_moment, put_openness, repair, spread_of};
 use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, deep_len, rows_extremes};
-use super::along::SLACK;
-use super::columns::{self, BLOCK, Columns};
 use super::lines::{self, Add, Coding, Elem, Lines, Masked, Op, Sources};
 use super::merge::{Moments, Sum, Wanted, gather, grow, tree_merge};
 use super::plan::{self, Job, Needs, Plain, Stage, Tile, cut, padded};
@@ -47,8 +47,13 @@ const STRIP: usize = 256;
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
-    let rows = padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
-    Emit::bytes(job.tile[1]) + padded::<T>(Stage::len(job, size_of::<T>())) + padded::<f64>(job.tile[1]) + k * (planes + rows) + Buffers::<T::Total>::bytes(job)
+    let rows =
+        padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
+    Emit::bytes(job.tile[1])
+        + padded::<T>(Stage::len(job, size_of::<T>()))
+        + padded::<f64>(job.tile[1])
+        + k * (planes + rows)
+        + Buffers::<T::Total>::bytes(job)
 }
 
 /// Moments on their way through the three axes.
@@ -128,14 +133,49 @@ pub fn run<T: Float>(
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
     let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
-    for tile in Tile::all(job) {
-        for (x, c) in columns[..tile.size[1]].iter_mut().enumerate() {
-            *c = job.count(2, tile.x + x) as f64;
-        }
-        lo.fill(T::GREATEST);
-        hi.fill(T::LEAST);
-        b.planes.clear();
-        for z0 in (0..dst[0]).step_by(job.batch) {
+    let corners = (0..dst[2]).step_by(job.tile[1]).flat_map(|x| (0..dst[0]).step_by(job.batch).map(move |z| (x, z)));
+    for (x, z0) in corners {
+        for y in (0..dst[1]).step_by(job.tile[0]) {
+            let mut tile = Tile::new(job, y, x);
+            if y == 0 && z0 == 0 {
+                for (i, c) in columns[..tile.size[1]].iter_mut().enumerate() {
+                    *c = job.count(2, x + i) as f64;
+                }
+                lo.fill(T::GREATEST);
+                hi.fill(T::LEAST);
+                b.planes.clear();
+            }
+            // Rows that do not exist are neutral; those that the tile above has made are kept.
+            let covered = (tile.rows.0, tile.rows.1);
+            let kept = if y == 0 { 0 } else { 2 * job.radius[1] };
+            for plane in (0..job.batch).map(|k| k * job.plane()) {
+                let from = plane + job.tile[0] * job.pitch..plane + (job.tile[0] + kept) * job.pitch;
+                if kept > 0 {
+                    if needs.extremes {
+                        lo.copy_within(from.clone(), plane);
+                        hi.copy_within(from.clone(), plane);
+                    }
+                    if needs.mean {
+                        b.planes.copy_within(from, plane);
+                    }
+                }
+                for rows in [kept..covered.0, covered.1..job.height] {
+                    if rows.start >= rows.end {
+                        continue;
+                    }
+                    let gap = plane + rows.start * job.pitch..plane + rows.end * job.pitch;
+                    if needs.extremes {
+                        lo[gap.clone()].fill(T::GREATEST);
+                        hi[gap.clone()].fill(T::LEAST);
+                    }
+                    if needs.mean {
+                        b.planes.part(gap).clear();
+                    }
+                }
+            }
+            // Rows above have been made already, whether `src` covers them or not.
+            let skipped = kept.clamp(covered.0, covered.1) - covered.0;
+            tile.rows = (covered.0 + skipped, covered.1, tile.rows.2 + skipped);
             let fast = needs.mean && wanted == Wanted::SUMS && T::COLUMNS && columns::fits(job.window[0]);
             if needs.extremes || fast {
                 let sums = if fast { &mut *b.planes.s } else { &mut [] };
@@ -371,13 +411,7 @@ crate::multiversion! {
 }
 
 #[inline(always)]
-fn four_merges_inner<T: Float>(
-    rows: [&[T]; 4],
-    os: &mut [T::Total],
-    om: &mut [f64],
-    on: &mut [f64],
-    oi: &mut [f64],
-) {
+fn four_merges_inner<T: Float>(rows: [&[T]; 4], os: &mut [T::Total], om: &mut [f64], on: &mut [f64], oi: &mut [f64]) {
     let len = os.len();
     let (om, on, oi) = (&mut om[..len], &mut on[..len], &mut oi[..len]);
     let [a, b, c, d] = rows.map(|r| &r[..len]);

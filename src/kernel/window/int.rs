@@ -4,9 +4,9 @@
 //! an axis where the largest final value fits, since wrapped intermediate values cancel. [`run`] is instantiated per
 //! type by [`dispatch`], which checks the bounds.
 
+use super::along::SLACK;
 use super::emit::{Emit, IntRow};
 use super::estimate::{Acc, Code, RowSum, Width};
-use super::along::SLACK;
 use super::lines::{self, Add, Block, Coding, Elem, Lines, Masked, Op, Sources};
 use super::plan::{Job, Plain, Stage, Tile, bits, cut, padded};
 use crate::grid::View;
@@ -148,7 +148,10 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
     let stage = padded::<T>(Stage::len(job, size_of::<T>()));
-    let rows = stage + padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
+    let rows = stage
+        + padded::<T>(2 * job.pitch)
+        + padded::<T>(deep_len(job))
+        + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)

@@ -167,7 +167,8 @@ fn extremes_inner<T: Elem, const B: usize, const M: bool, const TWO: bool>(
         return;
     }
     // Lines beyond the clip repeat the nearest, so the lines common to all windows are one run.
-    let (left, right): ([usize; B], [usize; B]) = (std::array::from_fn(|k| lines.start(k)), std::array::from_fn(|k| lines.start(w - 1 + k)));
+    let (left, right): ([usize; B], [usize; B]) =
+        (std::array::from_fn(|k| lines.start(k)), std::array::from_fn(|k| lines.start(w - 1 + k)));
     let core = lines.start(B - 1);
     let ends = Ends::<B> { left, right, core: (core, 1 + (right[0] - core) / lines.pitch.max(1)), pitch: lines.pitch };
     let most = ends.right[B - 1] + cols; // starts grow with the line
@@ -221,7 +222,8 @@ unsafe fn join_line<T: Elem, const M: bool, const TWO: bool>(
 }
 
 /// One chunk of columns at `x`. The chains are written out: as loops they stay in memory, and each step waits for the
-/// store before it (2-core Zen 4 VM, AVX-512, 2026-11-23: cdf_power of u8, r=10, OLD ns/voxel, now NEW).
+/// store before it (2-core Zen 4 VM, AVX-512, 2026-11-23, busy machine: cdf_power of u16, r=10, 4.5 ns/voxel as loops,
+/// 3.8 written out).
 ///
 /// # Safety
 /// Every start of `ends` and `x` leave room for a chunk in both sources; so does every output line in `lo` and `hi`.
