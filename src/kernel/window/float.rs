@@ -3,7 +3,7 @@
 
 use super::along::SLACK;
 use super::columns::{self, BLOCK, Columns};
-use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
+use super::emit::{Emit, polarity, put_moment, put_openness, repair, spread_of};
 use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, deep_len, rows_extremes};
 use super::lines::{self, Add, Coding, Elem, Lines, Masked, Op, Sources};
@@ -133,14 +133,49 @@ pub fn run<T: Float>(
     let mut b = Buffers::<T::Total>::cut(job, wanted, bytes);
     let columns = cut::<f64>(bytes, job.tile[1]);
     let plain = Coding { flip: T::default(), missing: T::default() };
-    for tile in Tile::all(job) {
-        for (x, c) in columns[..tile.size[1]].iter_mut().enumerate() {
-            *c = job.count(2, tile.x + x) as f64;
-        }
-        lo.fill(T::GREATEST);
-        hi.fill(T::LEAST);
-        b.planes.clear();
-        for z0 in (0..dst[0]).step_by(job.batch) {
+    let corners = (0..dst[2]).step_by(job.tile[1]).flat_map(|x| (0..dst[0]).step_by(job.batch).map(move |z| (x, z)));
+    for (x, z0) in corners {
+        for y in (0..dst[1]).step_by(job.tile[0]) {
+            let mut tile = Tile::new(job, y, x);
+            if y == 0 && z0 == 0 {
+                for (i, c) in columns[..tile.size[1]].iter_mut().enumerate() {
+                    *c = job.count(2, x + i) as f64;
+                }
+                lo.fill(T::GREATEST);
+                hi.fill(T::LEAST);
+                b.planes.clear();
+            }
+            // Rows that do not exist are neutral; those that the tile above has made are kept.
+            let covered = (tile.rows.0, tile.rows.1);
+            let kept = if y == 0 { 0 } else { 2 * job.radius[1] };
+            for plane in (0..job.batch).map(|k| k * job.plane()) {
+                let from = plane + job.tile[0] * job.pitch..plane + (job.tile[0] + kept) * job.pitch;
+                if kept > 0 {
+                    if needs.extremes {
+                        lo.copy_within(from.clone(), plane);
+                        hi.copy_within(from.clone(), plane);
+                    }
+                    if needs.mean {
+                        b.planes.copy_within(from, plane);
+                    }
+                }
+                for rows in [kept..covered.0, covered.1..job.height] {
+                    if rows.start >= rows.end {
+                        continue;
+                    }
+                    let gap = plane + rows.start * job.pitch..plane + rows.end * job.pitch;
+                    if needs.extremes {
+                        lo[gap.clone()].fill(T::GREATEST);
+                        hi[gap.clone()].fill(T::LEAST);
+                    }
+                    if needs.mean {
+                        b.planes.part(gap).clear();
+                    }
+                }
+            }
+            // Rows above have been made already, whether `src` covers them or not.
+            let skipped = kept.clamp(covered.0, covered.1) - covered.0;
+            tile.rows = (covered.0 + skipped, covered.1, tile.rows.2 + skipped);
             let fast = needs.mean && wanted == Wanted::SUMS && T::COLUMNS && columns::fits(job.window[0]);
             if needs.extremes || fast {
                 let sums = if fast { &mut *b.planes.s } else { &mut [] };
@@ -218,10 +253,9 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
             WindowChannel::Openness(method, ties) => {
                 let polarity = polarity(emit.params, ties);
                 let (v, lo, hi) = (row.v, &row.lo[..len], &row.hi[..len]);
-                let fill = |o: &mut [f32]| match estimator(method) {
-                    Estimator::Power => T::cdf_power(level, v, lo, hi, row.s, n, polarity, o),
-                    Estimator::Beta => est::beta_row(level, v, lo, hi, row.s, row.m, n, polarity, o),
-                    Estimator::Spread(kind) => est::spread_row(level, kind, v, lo, hi, row.s, row.m, n, polarity, o),
+                let fill = |o: &mut [f32]| match spread_of(method) {
+                    None => T::cdf_power(level, v, lo, hi, row.s, n, polarity, o),
+                    Some(kind) => est::spread_row(level, kind, v, lo, hi, row.s, row.m, n, polarity, o),
                 };
                 put_openness(level, &mut out.dst, at, len, emit.open, fill);
             }

@@ -153,6 +153,19 @@ impl<'a, A: Sum> Moments<'a, A> {
         }
     }
 
+    /// Copies the elements of `from` to `to` on.
+    pub fn copy_within(&mut self, from: std::ops::Range<usize>, to: usize) {
+        fn of<T: Copy>(s: &mut [T], from: std::ops::Range<usize>, to: usize) {
+            if !s.is_empty() {
+                s.copy_within(from, to);
+            }
+        }
+        of(self.s, from.clone(), to);
+        of(self.m, from.clone(), to);
+        of(self.n, from.clone(), to);
+        of(self.i, from, to);
+    }
+
     pub fn clear(&mut self) {
         self.s.fill(A::default());
         self.m.fill(0.0);
