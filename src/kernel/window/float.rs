@@ -3,7 +3,7 @@
 
 use super::along::SLACK;
 use super::columns::{self, BLOCK, Columns};
-use super::emit::{Emit, polarity, put_moment, put_openness, repair, spread_of};
+use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
 use super::float_estimate::{self as est, Centre};
 use super::int::{blocked, deep_len, rows_extremes};
 use super::lines::{self, Add, Coding, Elem, Lines, Masked, Op, Sources};
@@ -253,9 +253,10 @@ fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool
             WindowChannel::Openness(method, ties) => {
                 let polarity = polarity(emit.params, ties);
                 let (v, lo, hi) = (row.v, &row.lo[..len], &row.hi[..len]);
-                let fill = |o: &mut [f32]| match spread_of(method) {
-                    None => T::cdf_power(level, v, lo, hi, row.s, n, polarity, o),
-                    Some(kind) => est::spread_row(level, kind, v, lo, hi, row.s, row.m, n, polarity, o),
+                let fill = |o: &mut [f32]| match estimator(method) {
+                    Estimator::Power => T::cdf_power(level, v, lo, hi, row.s, n, polarity, o),
+                    Estimator::Beta => est::beta_row(level, v, lo, hi, row.s, row.m, n, polarity, o),
+                    Estimator::Spread(kind) => est::spread_row(level, kind, v, lo, hi, row.s, row.m, n, polarity, o),
                 };
                 put_openness(level, &mut out.dst, at, len, emit.open, fill);
             }
