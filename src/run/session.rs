@@ -30,6 +30,9 @@ use crate::store::sink::Sink;
 use crate::store::{Source, VolumeInfo, open_inputs};
 use crate::{Error, Result};
 
+/// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
+const QUIET_UNPACK: u64 = 64 << 20;
+
 /// Turns a finished brick into chunks.
 type Deliver<'d> = dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync + 'd;
 
@@ -166,7 +169,9 @@ impl<'a> Session<'a> {
         for source in &mut self.sources {
             let cancel = &self.options.cancel;
             source.prepare(&dir, &|bytes| {
-                self.progress.update(bytes, total, 0, 0, "unpack");
+                if total > QUIET_UNPACK {
+                    self.progress.update(bytes, total, 0, 0, "unpack");
+                }
                 !cancel.is_cancelled()
             })?;
         }
