@@ -251,30 +251,4 @@ mod tests {
         let inside = |i: usize| i % 30 < 10 && i % 5 < 3;
         assert!((0..60).all(|i| dst[i] == if inside(i) { i as u8 } else { 200 }));
     }
-
-    /// `cargo test --release --lib convert::tests::speed -- --ignored --nocapture`
-    #[test]
-    #[ignore = "prints timings"]
-    fn speed() {
-        fn best(mut f: impl FnMut()) -> f64 {
-            (0..40).map(|_| std::time::Instant::now()).fold(f64::INFINITY, |least, _| {
-                let start = std::time::Instant::now();
-                f();
-                least.min(start.elapsed().as_secs_f64())
-            })
-        }
-        let n = 1 << 20;
-        let shape = [1, 1 << 10, 1 << 10];
-        let src: Vec<f32> = (0..n).map(|i| i as f32 / n as f32).collect();
-        let (mut bytes, mut words, mut copy) = (vec![0u8; n], vec![0u16; n], vec![0f32; n]);
-        let unit = Mapping { range: Some([0.0, 1.0]), fill: 0.0 };
-        let ns = |t: f64| t * 1e9 / n as f64;
-        println!("memcpy f32: {:.3} ns/voxel", ns(best(|| std::hint::black_box(&mut copy).copy_from_slice(&src))));
-        for level in Level::available() {
-            let from = || AnyView::F32(View::dense(std::hint::black_box(&src), shape));
-            let t8 = best(|| convert_at(level, from(), unit, AnyViewMut::U8(ViewMut::dense(&mut bytes, shape))));
-            let t16 = best(|| convert_at(level, from(), unit, AnyViewMut::U16(ViewMut::dense(&mut words, shape))));
-            println!("{level:?} f32 to u8: {:.3}, to u16: {:.3} ns/voxel", ns(t8), ns(t16));
-        }
-    }
 }

@@ -338,35 +338,3 @@ fn buffers_are_reused() {
     assert_eq!((cells.capacity_bytes(), cells.value.as_ptr()), (held, at));
     assert_eq!(cells.shape, [2, 4, 4]);
 }
-
-/// `cargo test --release --lib reduce::tests::speed -- --ignored --nocapture`
-#[test]
-#[ignore = "prints timings"]
-fn speed() {
-    let shape = [64, 128, 128];
-    let mut scratch = Scratch::new();
-    for level in Level::available() {
-        let mut cx = Context { level, scratch: &mut scratch };
-        for (dtype, kind, excluded, nan) in [
-            (DType::F32, Reduce::Mean, 0.0, 0.0),
-            (DType::U8, Reduce::Mean, 0.0, 0.0),
-            (DType::U16, Reduce::Mean, 0.0, 0.0),
-            (DType::F32, Reduce::Mean, 0.0, 0.01),
-            (DType::F32, Reduce::Mean, 0.3, 0.0),
-            (DType::F32, Reduce::Max, 0.0, 0.0),
-            (DType::U8, Reduce::Max, 0.0, 0.0),
-            (DType::F32, Reduce::Moments, 0.0, 0.0),
-        ] {
-            let case = Case::random(shape, dtype, nan, excluded, 1);
-            let mut cells = Cells::default();
-            let mut best = f64::INFINITY;
-            for _ in 0..30 {
-                let t = std::time::Instant::now();
-                cells.first(kind, false, case.level0(), ALL, &mut cx);
-                best = best.min(t.elapsed().as_secs_f64());
-            }
-            let ns = best * 1e9 / case.value.len() as f64;
-            println!("{level:?} {dtype} {kind:?} nan {nan} excluded {excluded}: {ns:.3} ns/voxel");
-        }
-    }
-}

@@ -162,36 +162,4 @@ mod tests {
         let codes: Vec<u16> = bytes.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)).collect();
         assert_eq!(codes, [1, 2, 9, 4, 5, 9, 9, 9, 9, 9, 9, 9, 9, 9, 9, 9, 9, 9]);
     }
-
-    /// `cargo test --release --lib encode::tests::speed -- --ignored --nocapture`
-    #[test]
-    #[ignore = "prints timings"]
-    fn speed() {
-        let (shape, n) = ([64; 3], 64 * 64 * 64);
-        let wave = |i: usize| {
-            ((i % 64) as f64 * 0.1).sin() + ((i / 64 % 64) as f64 * 0.07).cos() + (i * 7919 % 97) as f64 / 970.0
-        };
-        let bytes: Vec<u8> = (0..n).map(|i| (60.0 * (2.0 + wave(i))) as u8).collect();
-        let floats: Vec<f32> = (0..n).map(|i| wave(i) as f32).collect();
-        for codec in [Codec::BloscLz4, Codec::Zstd(1), Codec::None] {
-            for (dtype, view) in [
-                (DType::U8, AnyView::U8(View::dense(&bytes, shape))),
-                (DType::F32, AnyView::F32(View::dense(&floats, shape))),
-            ] {
-                let encoder = Encoder::new(codec, dtype, 0.0);
-                let (mut best, mut stored) = (f64::INFINITY, 0);
-                for _ in 0..40 {
-                    let start = std::time::Instant::now();
-                    stored = encoder.encode(view, shape).unwrap().len();
-                    best = best.min(start.elapsed().as_secs_f64());
-                }
-                let raw = n * dtype.size();
-                println!(
-                    "{codec:?} {dtype}: {:.0} MB/s, ratio {:.2}",
-                    raw as f64 / best / 1e6,
-                    raw as f64 / stored as f64
-                );
-            }
-        }
-    }
 }
