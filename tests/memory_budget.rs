@@ -26,6 +26,15 @@ fn peak_of(mut child: std::process::Child) -> (u64, std::process::ExitStatus) {
     }
 }
 
+/// Runs the program on a config, which must succeed, and returns its peak.
+fn peak_of_run(config: &std::path::Path) -> u64 {
+    let mut command = Command::new(program());
+    command.arg("run").arg(config).arg("-q").stdout(Stdio::null()).stderr(Stdio::inherit());
+    let (peak, status) = peak_of(command.spawn().unwrap());
+    assert!(status.success());
+    peak
+}
+
 #[test]
 fn a_gibibyte_under_a_quarter_of_it() {
     let dir = tempfile::tempdir().unwrap();
@@ -57,16 +66,7 @@ path = "ao.zarr"
 from = "ao"
 "#;
     std::fs::write(&path, text).unwrap();
-    let child = Command::new(program())
-        .arg("run")
-        .arg(&path)
-        .arg("-q")
-        .stdout(Stdio::null())
-        .stderr(Stdio::inherit())
-        .spawn()
-        .unwrap();
-    let (peak, status) = peak_of(child);
-    assert!(status.success());
+    let peak = peak_of_run(&path);
     println!("peak {} MiB under a budget of 256 MiB", peak / MIB);
     assert!(peak <= (256 + 128) * MIB, "peak {} MiB", peak / MIB);
     // The same through a chunked source, whose decoded chunks count as well.
@@ -88,16 +88,7 @@ range = [0, 255]
 "#;
     let path = dir.path().join("second.toml");
     std::fs::write(&path, second).unwrap();
-    let child = Command::new(program())
-        .arg("run")
-        .arg(&path)
-        .arg("-q")
-        .stdout(Stdio::null())
-        .stderr(Stdio::inherit())
-        .spawn()
-        .unwrap();
-    let (peak, status) = peak_of(child);
-    assert!(status.success());
+    let peak = peak_of_run(&path);
     println!("peak {} MiB from Zarr under a budget of 256 MiB", peak / MIB);
     assert!(peak <= (256 + 128) * MIB, "peak {} MiB", peak / MIB);
 }

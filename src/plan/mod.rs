@@ -83,7 +83,7 @@ impl Plan {
             placement,
             gpu,
         };
-        plan.groups = tasks::groups(&plan, config)?;
+        plan.groups = tasks::groups(&plan);
         for g in 0..plan.groups.len() {
             plan.groups[g].brick = brick::choose(&plan, &plan.groups[g], config)?;
         }

@@ -5,8 +5,7 @@
 
 use super::graph::{StepId, WireId, max3};
 use super::{BrickChoice, OutputPlan, Plan};
-use crate::Result;
-use crate::config::{Config, OutputFormat};
+use crate::config::OutputFormat;
 use crate::grid::{Region, Shape};
 use crate::store::LevelLayout;
 
@@ -142,7 +141,7 @@ impl OutputPlan {
 }
 
 /// Groups outputs by shape and cuts each group into tasks.
-pub fn groups(plan: &Plan, config: &Config) -> Result<Vec<Group>> {
+pub fn groups(plan: &Plan) -> Vec<Group> {
     let mut groups: Vec<Group> = Vec::new();
     for (o, output) in plan.outputs.iter().enumerate() {
         let shape = plan.graph.lattices[output.lattice].shape;
@@ -165,14 +164,13 @@ pub fn groups(plan: &Plan, config: &Config) -> Result<Vec<Group>> {
         });
         groups[at].outputs.push(o);
     }
-    let _ = config;
     let mut first_task = 0;
     for group in &mut groups {
         fill_group(plan, group);
         group.first_task = first_task;
         first_task += group.task_count();
     }
-    Ok(groups)
+    groups
 }
 
 fn fill_group(plan: &Plan, group: &mut Group) {

@@ -11,7 +11,7 @@ use super::steps::MaskValue;
 use super::value::{Comp, Value};
 use crate::Result;
 use crate::brick::{Pool, Scratch, Voxels, gather};
-use crate::grid::{AnyView, DType, Region, View};
+use crate::grid::{AnyView, Region, View};
 use crate::kernel::convert::{Mapping, convert_at};
 use crate::kernel::reduce::{Cells, Level0, planes};
 use crate::kernel::simd::Level;
@@ -335,9 +335,4 @@ impl Scaled<'_> {
 pub fn as_bytes(numbers: &[f64]) -> &[u8] {
     // SAFETY: f64 has no padding.
     unsafe { std::slice::from_raw_parts(numbers.as_ptr().cast(), size_of_val(numbers)) }
-}
-
-/// Bytes of the output's type per voxel, for spills.
-pub fn item_size(dtype: DType) -> usize {
-    dtype.size()
 }

@@ -7,12 +7,15 @@ use std::sync::{Arc, Condvar, Mutex};
 use super::metrics::Metrics;
 use crate::Result;
 use crate::brick::{Pool, Voxels};
-use crate::grid::{DType, Region, Shape};
+use crate::grid::{Region, Shape};
 use crate::store::Source;
 use crate::store::source::ChunkRead;
 
 /// Which chunk: input, component, index.
 type Key = (usize, usize, [i64; 3]);
+
+/// In place of a number of uses: a mask looks at the chunk, and the brick itself may still read it.
+pub const UNCOUNTED: u32 = u32::MAX;
 
 /// A decoded chunk.
 #[derive(Debug, Clone)]
@@ -90,8 +93,11 @@ impl ChunkCache {
         result
     }
 
-    /// Counts one use; after the last the chunk leaves.
+    /// Counts one use; after the last the chunk leaves. A look that is no brick's read ([`UNCOUNTED`]) leaves the count alone.
     fn used(&self, state: &mut State, key: Key, uses: u32) {
+        if uses == UNCOUNTED {
+            return;
+        }
         let left = state.left.entry(key).or_insert(uses);
         *left = left.saturating_sub(1);
         if *left == 0 {
@@ -173,9 +179,4 @@ impl Uses {
     pub fn chunks(&self, region: Region) -> Region {
         region.cells([0; 3], self.chunk)
     }
-}
-
-/// Bytes of one decoded chunk.
-pub fn chunk_bytes(shape: Shape, dtype: DType) -> u64 {
-    shape.iter().map(|&n| n as u64).product::<u64>() * dtype.size() as u64
 }

@@ -4,7 +4,7 @@
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
-use super::cache::{Chunk, ChunkCache, Uses};
+use super::cache::{Chunk, ChunkCache, UNCOUNTED, Uses};
 use super::metrics::Metrics;
 use super::program::Program;
 use super::steps::{Engine, MaskValue};
@@ -122,8 +122,7 @@ impl Reader<'_> {
         let mut target = None;
         let mut common: Option<f64> = None;
         for index in cells.iter() {
-            // A mask's look does not count: the brick itself may follow.
-            let uses = if counts { uses.of(index) } else { u32::MAX };
+            let uses = if counts { uses.of(index) } else { UNCOUNTED };
             let chunk = self.cache.get(source, (input, comp, index), uses, self.engine.pool, self.metrics)?;
             let chunk_box = Region::of_cell(index, [0; 3], shape);
             if let (Chunk::Missing(value), None) = (&chunk, &target)

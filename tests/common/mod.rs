@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use occlude::brick::Voxels;
 use occlude::config::{self, Config};
-use occlude::grid::{Region, Voxel};
+use occlude::grid::Region;
 use occlude::run::{Report, RunOptions, Silent};
 
 /// A number from a seed and an index: the same on every machine.
@@ -15,11 +15,6 @@ pub fn hash(seed: u64, index: u64) -> u64 {
     let mut h = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ index.wrapping_mul(0xbf58_476d_1ce4_e5b9);
     h = (h ^ (h >> 31)).wrapping_mul(0x94d0_49bb_1331_11eb);
     h ^ (h >> 29)
-}
-
-/// Little-endian bytes of voxels.
-pub fn bytes<T: Voxel>(voxels: &[T]) -> Vec<u8> {
-    voxels.iter().flat_map(|v| v.to_f64().to_le_bytes()).collect()
 }
 
 /// Writes an array as .npy.
