@@ -164,10 +164,12 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
             let whole = k == 0 && (0..3).all(|a| group.brick.shape[a].is_multiple_of(output.spec.chunk[a]));
             total += if whole { 0 } else { level.min(chunk * 8 * row.max(1)) };
         }
-        // Cells kept for the second phase.
-        let deepest = output.level(output.brick_level()).expect("level exists").factor;
-        let cells = task / deepest.iter().map(|&f| f as u64).product::<u64>();
-        total += cells * parts * reduce::bytes_per_cell(output.reduce) as u64;
+        // Cells kept for the second phase, where there is one.
+        if output.level_count() > output.brick_level() + 1 {
+            let deepest = output.level(output.brick_level()).expect("level exists").factor;
+            let cells = task / deepest.iter().map(|&f| f as u64).product::<u64>();
+            total += cells * parts * reduce::bytes_per_cell(output.reduce) as u64;
+        }
     }
     total
 }
