@@ -11,7 +11,7 @@ use occlude::gpu::{Gpu, GpuKind, Times};
 use occlude::grid::{Affine, DType, Shape};
 use occlude::kernel::Context;
 use occlude::kernel::simd::Level;
-use occlude::kernel::window::{WindowOut, window};
+use occlude::kernel::window::{Place, WindowOut, window};
 use occlude::stage::{Method, Ties, WindowChannel, WindowParams};
 
 const ROUNDS: usize = 3;
@@ -52,7 +52,7 @@ fn call(
     let times = match gpu {
         Some(gpu) => gpu.window(volume.view(shape), &p, [0; 3], &mut outs, &mut cx).expect("the device works"),
         None => {
-            window(volume.view(shape), &p, [0; 3], &mut outs, &mut cx);
+            window(volume.view(shape), &p, Place::whole([0; 3]), &mut outs, &mut cx);
             Times::default()
         }
     };

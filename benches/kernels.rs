@@ -7,7 +7,7 @@ use occlude::brick::{Scratch, Voxels};
 use occlude::grid::{Affine, AnyView, DType, Shape};
 use occlude::kernel::Context;
 use occlude::kernel::simd::Level;
-use occlude::kernel::window::{WindowOut, reference, window};
+use occlude::kernel::window::{Place, WindowOut, reference, window};
 use occlude::stage::{Method, Ties, WindowChannel, WindowParams};
 
 const SHAPE: Shape = [415, 256, 256];
@@ -61,7 +61,7 @@ fn call(
 ) {
     let mut outs: Vec<WindowOut> =
         dst.iter_mut().zip(channels).map(|(d, c)| WindowOut { channel: *c, dst: d.view_mut(shape) }).collect();
-    window(src, p, [0; 3], &mut outs, cx);
+    window(src, p, Place::whole([0; 3]), &mut outs, cx);
 }
 
 fn outputs(dtype: DType, shape: Shape, channels: &[WindowChannel]) -> Vec<Voxels> {

@@ -11,7 +11,7 @@ use occlude::config;
 use occlude::grid::{Affine, DType, Region};
 use occlude::kernel::Context;
 use occlude::kernel::simd::Level;
-use occlude::kernel::window::{WindowOut, window};
+use occlude::kernel::window::{Place, WindowOut, window};
 use occlude::run::{Report, RunOptions, Silent};
 use occlude::stage::{Method, Ties, WindowChannel, WindowParams};
 
@@ -63,7 +63,7 @@ fn kernel(v: &Voxels) -> f64 {
             let start = Instant::now();
             let mut outs = [WindowOut { channel, dst: out.view_mut(half) }];
             let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
-            window(v.view(SHAPE), &params, [z, 0, 0], &mut outs, &mut cx);
+            window(v.view(SHAPE), &params, Place::whole([z, 0, 0]), &mut outs, &mut cx);
             best = best.min(start.elapsed().as_secs_f64());
         }
         best

@@ -14,7 +14,7 @@ use occlude::gpu::{Gpu, GpuFacts, GpuKind, facts};
 use occlude::grid::{Affine, DType, Shape, Voxel};
 use occlude::kernel::Context;
 use occlude::kernel::simd::Level;
-use occlude::kernel::window::{WindowOut, window};
+use occlude::kernel::window::{Place, WindowOut, window};
 use occlude::plan::Plan;
 use occlude::run::{RunOptions, Session, Silent};
 use occlude::stage::{Method, Ties, WindowChannel, WindowParams};
@@ -100,7 +100,7 @@ fn results(
     let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
     match gpu {
         Some(gpu) => drop(gpu.window(volume.view(shape), p, at, &mut outs, &mut cx).unwrap_or_else(|e| panic!("{e}"))),
-        None => window(volume.view(shape), p, at, &mut outs, &mut cx),
+        None => window(volume.view(shape), p, Place::whole(at), &mut outs, &mut cx),
     }
     made
 }

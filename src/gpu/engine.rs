@@ -92,7 +92,7 @@ impl Gpu {
         let needs = Needs::of(channels.into_iter(), false);
         let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs);
         let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap)?))) else {
-            window::window(src, params, at, outs, cx);
+            window::window(src, params, window::Place::whole(at), outs, cx); // integers are exact
             return Ok(Times::default());
         };
         let run = |outs: &mut [WindowOut], cx: &mut Context| {

@@ -9,7 +9,7 @@ use crate::gpu::Gpu;
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut, Voxel};
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::simd::Level;
-use crate::kernel::window::WindowOut;
+use crate::kernel::window::{Place, WindowOut};
 use crate::kernel::{Context, gaussian, gradient, mask, pointwise, rank, window};
 use crate::plan::Plan;
 use crate::plan::graph::{
@@ -240,7 +240,7 @@ impl<'a> Engine<'a> {
                     Some(gpu) => gpu.window(src.view(), &params, src.at, &mut outs, cx).map(|_| ()).map_err(|e| {
                         Error::Failed(format!("{} on the GPU: {e}; --resume continues", step.stages.join("+")))
                     })?,
-                    None => window::window(src.view(), &params, src.at, &mut outs, cx),
+                    None => window::window(src.view(), &params, Place::new(src.at, src.voxel), &mut outs, cx),
                 }
             }
             StepKind::Rank { params, shape, ties } => {
@@ -382,6 +382,7 @@ impl<'a> Engine<'a> {
         let whole = Windowed {
             src: Src::Borrowed(value.view(comp, inside)),
             at: inside.offset_of(&region),
+            voxel: region.lo,
             affine: wire.affine,
             missing: wire.missing,
         };
@@ -412,7 +413,7 @@ impl<'a> Engine<'a> {
             padded = self.pool.take(dtype, wanted.voxels());
             extend_any(src, value.region, &mut padded, wanted, volume, step.border, outside);
         }
-        Windowed { src: Src::Owned(padded, wanted.shape()), at, affine: wire.affine, missing }
+        Windowed { src: Src::Owned(padded, wanted.shape()), at, voxel: region.lo, affine: wire.affine, missing }
     }
 }
 
@@ -420,6 +421,8 @@ impl<'a> Engine<'a> {
 struct Windowed<'a> {
     src: Src<'a>,
     at: [usize; 3],
+    /// The output box's first voxel in the volume.
+    voxel: [i64; 3],
     affine: Affine,
     missing: Option<i64>,
 }

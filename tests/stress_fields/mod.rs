@@ -136,7 +136,7 @@ pub fn windows(field: &Field, volume: &Voxels, channels: &[WindowChannel]) -> Ve
         .collect();
     let mut scratch = Scratch::new();
     let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
-    window::window(volume.view(field.shape), &params, [0; 3], &mut outs, &mut cx);
+    window::window(volume.view(field.shape), &params, window::Place::whole([0; 3]), &mut outs, &mut cx);
     results
 }
 

@@ -260,28 +260,39 @@ fn cdf_power_as<T: Code, X1: RowSum, const FLIPPED: bool>(
 ) {
     let len = out.len();
     let (v, lo, hi, s1, n) = (&v[..len], &lo[..len], &hi[..len], &s1[..len], &n[..len]);
-    for i in 0..len {
-        let c = v[i].code(flip);
-        let below = c.above(lo[i]);
-        let above = hi[i].above(c);
-        let small = T::TOP <= u16::MAX as u32; // differences below 2^24: exact
-        let range = if small { below + above } else { hi[i].above(lo[i]) };
-        // Sums of (v_i - min) and (max - v_i): exact, so beta keeps its relative accuracy whatever its size.
-        let over = s1[i].minus(X1::times(n[i], lo[i].u32())).f32();
-        let under = X1::times(n[i], hi[i].u32()).minus(s1[i]).f32();
-        let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
-        // One division for both quotients; range and q are at least 1 unless all is constant, their product below 2^96.
-        let inverse = 1.0 / (range * q);
-        let beta = p * range * inverse;
-        let beta = if beta > 1e-6 { beta } else { 1e-6 };
-        let beta = if beta < 1e6 { beta } else { 1e6 };
-        let near = 3.0 * b < range;
-        let y = math::power_of(if near { -b } else { a } * (q * inverse), near, beta);
-        let y = if a == 0.0 { 0.0 } else { y };
-        let y = if b == 0.0 { 1.0 } else { y };
-        out[i] = if range == 0.0 { constant } else { y };
+    for at in (0..len).step_by(CHUNK) {
+        let end = len.min(at + CHUNK);
+        if lo[at..end].iter().zip(&hi[at..end]).fold(true, |flat, (a, b)| flat & (a == b)) {
+            out[at..end].fill(constant);
+            continue;
+        }
+        for i in at..end {
+            let c = v[i].code(flip);
+            let below = c.above(lo[i]);
+            let above = hi[i].above(c);
+            let small = T::TOP <= u16::MAX as u32; // differences below 2^24: exact
+            let range = if small { below + above } else { hi[i].above(lo[i]) };
+            // Sums of (v_i - min) and (max - v_i): exact, so beta keeps its relative accuracy whatever its size.
+            let over = s1[i].minus(X1::times(n[i], lo[i].u32())).f32();
+            let under = X1::times(n[i], hi[i].u32()).minus(s1[i]).f32();
+            let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
+            // One division for both quotients; range and q are at least 1 unless all is constant, their product below 2^96.
+            let inverse = 1.0 / (range * q);
+            let beta = p * range * inverse;
+            let beta = if beta > 1e-6 { beta } else { 1e-6 };
+            let beta = if beta < 1e6 { beta } else { 1e6 };
+            let near = 3.0 * b < range;
+            let y = math::power_of(if near { -b } else { a } * (q * inverse), near, beta);
+            let y = if a == 0.0 { 0.0 } else { y };
+            let y = if b == 0.0 { 1.0 } else { y };
+            out[i] = if range == 0.0 { constant } else { y };
+        }
     }
 }
+
+/// Voxels whose windows are asked together whether they are all constant, as in air that a detector or a mask has set to
+/// one value.
+const CHUNK: usize = 64;
 
 /// Estimators that use the mean and the variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -338,15 +349,22 @@ fn spread_inner<T: Code, X1: RowSum>(
     let sign = if polarity.flipped { -1.0 } else { 1.0 };
     macro_rules! row {
         ($kind:expr) => {
-            for i in 0..len {
-                let c = v[i].code(flip).u32();
-                let d = if T::TOP <= u16::MAX as u32 {
-                    (n[i] as f64).mul_add(c as f64, -small(s1[i].low())) as f32 // n < 2^31: exact before the cast
-                } else {
-                    (n[i] as u64 * c as u64).wrapping_sub(s1[i].low()) as i64 as f32
-                };
-                let y = spread($kind, sign * d, numerator[i] as f32);
-                out[i] = if numerator[i] == 0.0 { polarity.constant } else { y };
+            for at in (0..len).step_by(CHUNK) {
+                let end = len.min(at + CHUNK);
+                if numerator[at..end].iter().fold(true, |flat, m| flat & (*m == 0.0)) {
+                    out[at..end].fill(polarity.constant);
+                    continue;
+                }
+                for i in at..end {
+                    let c = v[i].code(flip).u32();
+                    let d = if T::TOP <= u16::MAX as u32 {
+                        (n[i] as f64).mul_add(c as f64, -small(s1[i].low())) as f32 // n < 2^31: exact before the cast
+                    } else {
+                        (n[i] as u64 * c as u64).wrapping_sub(s1[i].low()) as i64 as f32
+                    };
+                    let y = spread($kind, sign * d, numerator[i] as f32);
+                    out[i] = if numerator[i] == 0.0 { polarity.constant } else { y };
+                }
             }
         };
     }

@@ -5,7 +5,7 @@ use super::emit::{Emit, IntRow};
 use super::estimate::{Acc, Code, RowSum, Width};
 use super::int::{Dispatch, Setup};
 use super::plan::{self, Job, Needs, Plain, cut, padded};
-use super::{WindowOut, check};
+use super::{Place, WindowOut, check};
 use crate::grid::{AnyView, Shape, View, Voxel};
 use crate::kernel::Context;
 use crate::stage::WindowParams;
@@ -73,7 +73,7 @@ fn typed<S: Voxel + Plain, C: Dispatch>(
 ) {
     let needs = Needs::of(outs.iter().map(|o| o.channel), false);
     // The whole call's job, not the part's: widths must not depend on how a call was cut.
-    let job = Job::new(src.shape, dst, at, params, needs, plan::batch_bytes(S::DTYPE, needs));
+    let job = Job::new(src.shape, dst, Place::whole(at), params, needs, plan::batch_bytes(S::DTYPE, needs));
     let width = job.tile[1];
     let mut bytes = cx.scratch.take(Emit::bytes(width) + 2 * padded::<C>(width) + 2 * padded::<u32>(width));
     let mut emit = Emit::new(outs, params, cx.level, width, &mut bytes);
@@ -122,9 +122,10 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
                     (lo[i], hi[i]) = (T::from_f64((e & 0xffff) as f64), T::from_f64((e >> 16) as f64));
                 }
             }
-            let start = job.at[2] + first;
+            let at = job.at.map(|v| v as usize); // integers skip no output
+            let start = at[2] + first;
             let row = IntRow {
-                v: &src.row_at(job.at[0] + oz, job.at[1] + oy)[start..start + len],
+                v: &src.row_at(at[0] + oz, at[1] + oy)[start..start + len],
                 lo: &lo[..len],
                 hi: &hi[..len],
                 s1: if job.needs.mean { &s1[from..from + len] } else { &[] },

@@ -19,6 +19,64 @@ fn mean_inner<A: Sum>(s: &[A], n: &[f64], out: &mut [f64]) {
 }
 
 crate::multiversion! {
+    /// Finished sums from their parts; `lo` is empty where they have one.
+    pub fn totals_row[A: Sum](hi: &[f64], lo: &[f64], out: &mut [A]) -> () = totals_inner;
+}
+
+#[inline(always)]
+fn totals_inner<A: Sum>(hi: &[f64], lo: &[f64], out: &mut [A]) {
+    let hi = &hi[..out.len()];
+    if A::PAIR {
+        let lo = &lo[..out.len()];
+        for i in 0..out.len() {
+            out[i] = A::of(hi[i], lo[i]);
+        }
+    } else {
+        for i in 0..out.len() {
+            out[i] = A::of(hi[i], 0.0);
+        }
+    }
+}
+
+crate::multiversion! {
+    /// Voxels of windows of `lines` whole lines of `section` voxels.
+    pub fn whole_counts_row[](lines: &[f64], section: f64, n: &mut [f64]) -> () = whole_counts_inner;
+}
+
+#[inline(always)]
+fn whole_counts_inner(lines: &[f64], section: f64, n: &mut [f64]) {
+    for (n, c) in n.iter_mut().zip(lines) {
+        *n = section * c;
+    }
+}
+
+crate::multiversion! {
+    /// The same where voxels are missing: `share` are the voxels of a window in shares of whole windows.
+    pub fn counts_row[](share: &[f64], lines: &[f64], section: f64, n: &mut [f64]) -> () = counts_inner;
+}
+
+#[inline(always)]
+fn counts_inner(share: &[f64], lines: &[f64], section: f64, n: &mut [f64]) {
+    for ((n, s), c) in n.iter_mut().zip(share).zip(lines) {
+        *n = (s * (section * c)).round_ties_even(); // off by much less than half a voxel
+    }
+}
+
+crate::multiversion! {
+    /// M2 from M2 times the voxels of whole windows of `lines` lines of `section` voxels; 0 where it can only be an error of rounding, NaN where a window holds an infinity.
+    pub fn settle_row[A: Sum](s: &[A], n: &[f64], lines: &[f64], section: f64, m: &mut [f64]) -> () = settle_inner;
+}
+
+#[inline(always)]
+fn settle_inner<A: Sum>(s: &[A], n: &[f64], lines: &[f64], section: f64, m: &mut [f64]) {
+    for (((m, s), n), c) in m.iter_mut().zip(s).zip(n).zip(lines) {
+        let (v, s) = (*m / (section * c), s.rounded());
+        let v = if v * n > s * s * A::NOTHING { v } else { 0.0 };
+        *m = if s.is_finite() { v } else { f64::NAN };
+    }
+}
+
+crate::multiversion! {
     pub fn variance_row[](m: &[f64], n: &[f64], out: &mut [f64]) -> () = variance_inner;
 }
 
@@ -265,7 +323,7 @@ fn standard_inner<T: Voxel, A: Sum>(
                 let d = sign * s[i].less(n[i], v[i].to_f64());
                 let z = (d / (n[i] * m[i]).max(f64::MIN_POSITIVE).sqrt()) as f32;
                 let y: f32 = $of(z);
-                wild |= !s[i].is_finite() as u32;
+                wild |= !s[i].rounded().is_finite() as u32;
                 out[i] = if lo[i] == hi[i] { polarity.constant } else { y };
             }
         };

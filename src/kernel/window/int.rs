@@ -362,7 +362,8 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
             }
         };
         // The window of the plane before the first output; each output then adds one plane and drops one.
-        let (reach, first) = (job.radius[0], job.at[0]);
+        let at = job.at.map(|v| v as usize); // no output is skipped
+        let (reach, first) = (job.radius[0], at[0]);
         for z in (first as isize - 1 - reach as isize).max(0) as usize..(first + reach).min(job.src[0]) {
             slide_in(Some(z), None, &mut s1, &mut s2, &mut count);
         }
@@ -413,10 +414,9 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                             rows_counted = rows;
                         }
                     }
-                    let at = [job.at[0] + z, job.at[1] + y + j];
-                    let first = job.at[2] + x;
+                    let first = at[2] + x;
                     let row = IntRow {
-                        v: &src.row_at(at[0], at[1])[first..first + tile.size[1]],
+                        v: &src.row_at(at[0] + z, at[1] + y + j)[first..first + tile.size[1]],
                         lo: out_lo,
                         hi: out_hi,
                         s1: s1.out,

@@ -78,12 +78,6 @@ macro_rules! wrapping_add {
     )*};
 }
 wrapping_add!(u16 u32 u64 u128);
-impl Op<f64> for Add {
-    #[inline(always)]
-    fn join(a: f64, b: f64) -> f64 {
-        a + b
-    }
-}
 impl<E: Elem> Op<E> for Lo {
     #[inline(always)]
     fn join(a: E, b: E) -> E {

@@ -2,8 +2,8 @@
 //!
 //! Tiles as wide as possible in x go through z, then y, then x ([`plan`]); the raw planes are the ring, so nothing but
 //! a batch of reduced planes is kept, and the estimators consume rows while they are in L1.
-//! Integers use exact sums ([`int`]), floats sums and (mean, M2) merges in f64 along a tree that depends on the window
-//! alone ([`float`]). [`reference`] says in a page what must come out.
+//! Integers use exact sums ([`int`]), floats sums and (sum, M2) merges in f64 in an order that depends on the window and its
+//! place in the volume alone ([`float`], [`parts`]). [`reference`] says in a page what must come out.
 
 use super::Context;
 use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
@@ -11,7 +11,6 @@ use crate::stage::{WindowChannel, WindowParams};
 
 mod along;
 mod beta;
-mod columns;
 mod emit;
 mod estimate;
 pub mod finish;
@@ -22,6 +21,8 @@ mod lines;
 #[doc(hidden)]
 pub mod math;
 mod merge;
+mod moments;
+mod parts;
 mod plan;
 #[doc(hidden)]
 pub mod reference;
@@ -41,7 +42,29 @@ pub struct WindowOut<'a> {
     pub dst: AnyViewMut<'a>,
 }
 
-/// Computes every channel of `outs` for the box that starts at voxel `at` of `src`; all outputs have the same shape.
+/// Where the output box lies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// Its first voxel in `src`.
+    pub at: [usize; 3],
+    /// Its first voxel in the volume, modulo 8: sums of floats are put together in blocks that start at multiples of 8 of
+    /// the volume, so that bricks never show.
+    pub phase: [usize; 3],
+}
+
+impl Place {
+    /// `voxel` is the box's first voxel in the volume.
+    pub fn new(at: [usize; 3], voxel: [i64; 3]) -> Place {
+        Place { at, phase: voxel.map(|v| v.rem_euclid(parts::BLOCK as i64) as usize) }
+    }
+
+    /// For a `src` that starts where the volume does.
+    pub fn whole(at: [usize; 3]) -> Place {
+        Place::new(at, at.map(|v| v as i64))
+    }
+}
+
+/// Computes every channel of `outs` for the box of `src` at `place`; all outputs have the same shape.
 ///
 /// Missing voxels (NaN, or `params.missing` for integers) do not count. Where the centre is missing, float outputs are
 /// NaN and integer outputs 0. An infinity changes only the windows that hold it: minimum, maximum and mean follow IEEE,
@@ -51,21 +74,21 @@ pub struct WindowOut<'a> {
 /// with -inf, `chebyshev_literal` the reverse); NaN where both infinities meet. `solid_low` swaps the signs.
 ///
 /// Panics if extents or types disagree, or if a window could hold 2^31 voxels.
-pub fn window(src: AnyView, params: &WindowParams, at: [usize; 3], outs: &mut [WindowOut], cx: &mut Context) {
+pub fn window(src: AnyView, params: &WindowParams, place: Place, outs: &mut [WindowOut], cx: &mut Context) {
     let Some(dst) = outs.first().map(|o| o.dst.shape()) else { return };
-    check(src, params, at, dst, outs);
+    check(src, params, place.at, dst, outs);
     if dst.contains(&0) {
         return;
     }
     match src {
-        AnyView::U8(v) => integers::<u8, u8>(v, 0, params, at, dst, outs, cx),
-        AnyView::I8(v) => integers::<i8, u8>(v, 1 << 7, params, at, dst, outs, cx),
-        AnyView::U16(v) => integers::<u16, u16>(v, 0, params, at, dst, outs, cx),
-        AnyView::I16(v) => integers::<i16, u16>(v, 1 << 15, params, at, dst, outs, cx),
-        AnyView::U32(v) => integers::<u32, u32>(v, 0, params, at, dst, outs, cx),
-        AnyView::I32(v) => integers::<i32, u32>(v, 1 << 31, params, at, dst, outs, cx),
-        AnyView::F32(v) => float::run(v, params, at, dst, outs, cx),
-        AnyView::F64(v) => float::run(v, params, at, dst, outs, cx),
+        AnyView::U8(v) => integers::<u8, u8>(v, 0, params, place, dst, outs, cx),
+        AnyView::I8(v) => integers::<i8, u8>(v, 1 << 7, params, place, dst, outs, cx),
+        AnyView::U16(v) => integers::<u16, u16>(v, 0, params, place, dst, outs, cx),
+        AnyView::I16(v) => integers::<i16, u16>(v, 1 << 15, params, place, dst, outs, cx),
+        AnyView::U32(v) => integers::<u32, u32>(v, 0, params, place, dst, outs, cx),
+        AnyView::I32(v) => integers::<i32, u32>(v, 1 << 31, params, place, dst, outs, cx),
+        AnyView::F32(v) => float::run(v, params, place, dst, outs, cx),
+        AnyView::F64(v) => float::run(v, params, place, dst, outs, cx),
     }
 }
 
@@ -76,7 +99,7 @@ pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams
     }
     let needs = Needs::of(channels.iter().copied(), dtype.is_float());
     // No layout depends on where the box lies.
-    let job = Job::new(src, dst, [0; 3], params, needs, plan::batch_bytes(dtype, needs));
+    let job = Job::new(src, dst, Place::whole([0; 3]), params, needs, plan::batch_bytes(dtype, needs));
     let masked = params.missing.is_some();
     match dtype {
         DType::U8 | DType::I8 => int_bytes::<u8>(&job, masked),
@@ -113,13 +136,13 @@ fn integers<S: Voxel + Plain, C: Dispatch>(
     src: View<S>,
     flip: C,
     params: &WindowParams,
-    at: [usize; 3],
+    place: Place,
     dst: Shape,
     outs: &mut [WindowOut],
     cx: &mut Context,
 ) {
     let needs = Needs::of(outs.iter().map(|o| o.channel), false);
-    let job = Job::new(src.shape, dst, at, params, needs, plan::batch_bytes(S::DTYPE, needs));
+    let job = Job::new(src.shape, dst, place, params, needs, plan::batch_bytes(S::DTYPE, needs));
     // A marker that the type cannot hold marks nothing.
     let missing = params.missing.map(|m| m as f64).filter(|m| {
         let (least, most) = S::DTYPE.range();

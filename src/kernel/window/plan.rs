@@ -1,6 +1,8 @@
 //! Which moments a set of channels needs, how a call is cut into tiles, and how its scratch is laid out.
 
+use super::Place;
 use super::lines::{DEEP, Lines};
+use super::parts::{Axis, BLOCK};
 use crate::grid::{DType, Shape, View};
 use crate::stage::{Method, WindowChannel, WindowParams};
 
@@ -45,7 +47,10 @@ impl Needs {
 pub struct Job {
     pub src: Shape,
     pub dst: Shape,
-    pub at: [usize; 3],
+    /// Voxel of `src` at the first output. For floats outputs are counted from a start of blocks, at most 7 in front of the
+    /// first one asked for: [`Job::skip`] of them do not exist.
+    pub at: [isize; 3],
+    pub skip: [usize; 3],
     /// Radius, at most the extent of `src` less one: there a larger one changes no window, and bricks cannot disagree,
     /// since a radius beyond that makes every brick's `src` the whole axis.
     pub radius: [usize; 3],
@@ -69,19 +74,18 @@ pub struct Job {
 
 impl Job {
     /// `moments` is the bytes per voxel of the planes that a batch keeps.
-    pub fn new(src: Shape, dst: Shape, at: [usize; 3], params: &WindowParams, needs: Needs, moments: usize) -> Job {
+    pub fn new(src: Shape, dst: Shape, place: Place, params: &WindowParams, needs: Needs, moments: usize) -> Job {
         let radius: [usize; 3] = std::array::from_fn(|a| params.radius[a].min(src[a].saturating_sub(1)));
         let window = radius.map(|r| 2 * r + 1);
+        let at = place.at.map(|v| v as isize);
+        if needs.float {
+            return Job { at, ..Job::blocks(src, dst, radius, needs, moments) }.skipping(place.phase);
+        }
         let width = even(dst[2], MAX_WIDTH);
         let pitch = odd_lines(width + 2 * radius[2]);
         let planes = block(window[0], dst[0]);
-        // Each batch makes the lower levels of the float trees and the groups of extremes anew, so long windows want
-        // deep batches.
-        let deep = match needs {
-            _ if window[0] < DEEP => 1,
-            Needs { float: true, variance: true, .. } => 2,
-            _ => 4,
-        };
+        // Each batch makes the groups of extremes anew, so long windows want deep batches.
+        let deep = if window[0] < DEEP { 1 } else { 4 };
         let batch = planes * deep.min(dst[0].div_ceil(planes));
         let rows =
             (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
@@ -89,7 +93,40 @@ impl Job {
         let height = tile[0] + 2 * radius[1];
         let row_block = block(window[1], tile[0]);
         let rows = row_block * if window[1] < DEEP { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
-        Job { src, dst, at, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+        let skip = [0; 3];
+        Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+    }
+
+    /// Float windows come in blocks of eight that start at multiples of eight of the volume, and so do tiles and batches.
+    /// All sizes hold for any place.
+    fn blocks(src: Shape, dst: Shape, radius: [usize; 3], needs: Needs, moments: usize) -> Job {
+        let window = radius.map(|r| 2 * r + 1);
+        let most = dst.map(|n| (n + BLOCK - 1).next_multiple_of(BLOCK));
+        let width = most[2].min(FLOAT_WIDTH);
+        let pitch = odd_lines(width + 2 * radius[2]);
+        // Groups along z are made anew by each batch.
+        let batch = most[0].min(BLOCK * if window[0] < DEEP { 1 } else { 4 });
+        let rows = (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
+        let tile = [most[1].min(rows.max(2 * radius[1]).next_multiple_of(BLOCK)), width];
+        let height = tile[0] + 2 * radius[1];
+        let (planes, row_block) = (block(window[0], batch), block(window[1], tile[0]));
+        let rows = row_block * if window[1] < DEEP { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
+        let (at, skip) = ([0; 3], [0; 3]);
+        Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+    }
+
+    /// Starts `phase` outputs earlier.
+    fn skipping(mut self, phase: [usize; 3]) -> Job {
+        let (at, dst) = (self.at, self.dst);
+        self.at = std::array::from_fn(|a| at[a] - phase[a] as isize);
+        self.dst = std::array::from_fn(|a| dst[a] + phase[a]);
+        Job { skip: phase, ..self }
+    }
+
+    /// Lines along axis `a` of windows of `blocks` blocks from output `start` on.
+    pub fn axis(&self, a: usize, start: usize, blocks: usize) -> Axis {
+        let first = self.at[a] + start as isize - self.radius[a] as isize;
+        Axis { first, extent: self.src[a], window: self.window[a], blocks }
     }
 
     /// Most voxels in a window, and in its z-y section.
@@ -100,8 +137,8 @@ impl Job {
 
     /// Voxels of output index `i` of axis `a` that exist in its window.
     pub fn count(&self, a: usize, i: usize) -> usize {
-        let c = self.at[a] + i;
-        (c + self.radius[a] + 1).min(self.src[a]) - c.saturating_sub(self.radius[a])
+        let (c, r) = (self.at[a] + i as isize, self.radius[a] as isize);
+        ((c + r + 1).min(self.src[a] as isize) - (c - r).max(0)).max(0) as usize
     }
 
     /// Elements of a tile plane.
@@ -112,6 +149,8 @@ impl Job {
 
 /// Widest tile in x.
 const MAX_WIDTH: usize = 512;
+/// The same for floats, whose planes hold sums of 8 and 16 bytes.
+const FLOAT_WIDTH: usize = 256;
 /// Fewest rows of a tile (if there are as many).
 const MIN_ROWS: usize = 32;
 /// Bytes of batch planes to aim at: they and the raw planes share a 1 MiB L2. 2-core Zen 4 VM, AVX-512, 2026-11-23, busy
@@ -138,7 +177,7 @@ pub struct Stage {
 impl Stage {
     /// For the batch that starts at output plane `z0`.
     pub fn new(job: &Job, size: usize, z0: usize) -> Stage {
-        let first = (job.at[0] + z0) as isize - job.radius[0] as isize;
+        let first = job.at[0] + z0 as isize - job.radius[0] as isize;
         let end = (first + (job.batch + job.window[0] - 1) as isize).min(job.src[0] as isize);
         Stage { planes: (first.max(0) as usize, end as usize), first, pitch: Self::pitch(job, size) }
     }
@@ -187,7 +226,7 @@ fn block(window: usize, outputs: usize) -> usize {
 /// The part of a tile's buffer that `src` covers along an axis: buffer indices `lo..hi`, the first being `src` index
 /// `first`. `start` is the tile's first output index and `len` the buffer's extent.
 fn covered(job: &Job, axis: usize, start: usize, len: usize) -> (usize, usize, usize) {
-    let begin = (job.at[axis] + start) as isize - job.radius[axis] as isize;
+    let begin = job.at[axis] + start as isize - job.radius[axis] as isize;
     let lo = (-begin).max(0) as usize;
     let hi = ((job.src[axis] as isize - begin).max(0) as usize).min(len);
     (lo, hi.max(lo), (begin + lo as isize) as usize)
@@ -234,6 +273,11 @@ pub fn cut<'a, T: Plain>(bytes: &mut &'a mut [u8], len: usize) -> &'a mut [T] {
     assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
     // SAFETY: aligned (just checked) and long enough; `Plain` types take every bit pattern.
     unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }
+}
+
+/// The elements from `from` on; none of an empty slice.
+pub fn tail<T>(slice: &[T], from: usize) -> &[T] {
+    &slice[from.min(slice.len())..]
 }
 
 /// Bytes that [`cut`] takes.

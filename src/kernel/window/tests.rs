@@ -57,7 +57,7 @@ fn brick(
     macro_rules! part {
         ($($v:ident),*) => { match any { $(AnyView::$v(v) => AnyView::$v(v.part(from, size)),)* } };
     }
-    window(part!(U8, I8, U16, I16, U32, I32, F32, F64), p, at, &mut outs, &mut cx);
+    window(part!(U8, I8, U16, I16, U32, I32, F32, F64), p, Place::new(at, lo.map(|v| v as i64)), &mut outs, &mut cx);
     let promised = scratch_bytes(volume.dtype(), size, dst, p, channels);
     assert!(scratch.bytes() <= promised.max(128), "{} bytes taken, {promised} promised", scratch.bytes());
     results
@@ -430,7 +430,7 @@ fn codes_of_openness_are_within_half_a_code() {
             let mut codes = vec![0u8; SHAPE.iter().product()];
             let dst = AnyViewMut::U8(crate::grid::ViewMut::dense(&mut codes, SHAPE));
             let mut cx = Context { level: Level::detect(), scratch: &mut Scratch::new() };
-            window(volume.view(SHAPE), &p, [0; 3], &mut [WindowOut { channel, dst }], &mut cx);
+            window(volume.view(SHAPE), &p, Place::whole([0; 3]), &mut [WindowOut { channel, dst }], &mut cx);
             for (i, code) in codes.iter().enumerate() {
                 let c = [i / (SHAPE[1] * SHAPE[2]), i / SHAPE[2] % SHAPE[1], i % SHAPE[2]];
                 let exact = 255.0 * reference_at(&volume, SHAPE, c, &p, channel);
