@@ -14,6 +14,7 @@ mod beta;
 mod columns;
 mod emit;
 mod estimate;
+mod exact;
 pub mod finish;
 mod float;
 mod float_estimate;
