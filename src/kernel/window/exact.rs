@@ -57,7 +57,7 @@ mod tests {
         let shift = numerator.leading_zeros();
         let shifted = numerator << shift;
         // At least 2^65: the sticky bit lies far below the place where f64 rounds.
-        let quotient = shifted / denominator | (shifted % denominator != 0) as u128;
+        let quotient = (shifted / denominator) | !shifted.is_multiple_of(denominator) as u128;
         quotient as f64 * f64::from_bits((1023 - shift as u64) << 52)
     }
 
