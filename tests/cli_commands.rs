@@ -203,3 +203,68 @@ fn a_run_from_config_to_comparison() {
     assert!(code == 0 && out.is_empty() && err.is_empty(), "{err}");
     assert_eq!(call(f, &["run", "job.toml", "-q", "--resume"]).0, 0);
 }
+
+#[test]
+fn what_planning_refuses_points_at_the_line_of_the_key() {
+    let folder = tempfile::tempdir().unwrap();
+    let f = folder.path();
+    npy(&f.join("v.npy"), [4, 5, 6], |i| i as f32);
+    let text = "[run]\nthreads = 1\nmemory = \"1KiB\"\n[input.v]\npath = \"v.npy\"\nchannel = 0\n[stage.b]\nop = \"box\"\n\
+                input = \"v\"\nradius = 1\n[output.o]\npath = \"o.npy\"\nfrom = \"b\"\n";
+    for (from, to, expected) in [
+        ("", "", "c.toml:3: run.memory"),
+        ("memory = \"1KiB\"", "region = [[0, 9], [0, 5], [0, 6]]", "c.toml:3: run.region"),
+        ("radius = 1", "radius = \"2 mm\"", "c.toml:10: stage.b.radius"),
+        ("channel = 0", "channel = 3", "c.toml:6: input.v.channel"),
+    ] {
+        std::fs::write(f.join("c.toml"), text.replace(from, to)).unwrap();
+        let (code, _, err) = call(f, &["run", "c.toml"]);
+        assert!(code == 2 && err.contains(expected), "{code}, expected {expected}: {err}");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn paths_that_are_not_utf8_are_paths() {
+    use std::os::unix::ffi::OsStrExt;
+    let folder = tempfile::tempdir().unwrap();
+    let odd = folder.path().join(std::ffi::OsStr::from_bytes(b"\xff\xfe"));
+    std::fs::create_dir(&odd).unwrap();
+    npy(&odd.join("v.npy"), [4, 5, 6], |i| i as f32);
+    std::fs::write(odd.join("c.toml"), "[input.v]\npath = \"v.npy\"\n[output.o]\npath = \"o.zarr\"\nfrom = \"v\"\n")
+        .unwrap();
+    for (command, path) in [("plan", "c.toml"), ("run", "c.toml"), ("info", "o.zarr")] {
+        let output = Command::new(env!("CARGO_BIN_EXE_occlude")).arg(command).arg(odd.join(path)).output().unwrap();
+        assert_eq!(output.status.code(), Some(0), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+    }
+}
+
+#[test]
+fn overwrite_looks_at_every_output_before_it_deletes_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let f = folder.path();
+    npy(&f.join("v.npy"), [4, 5, 6], |i| i as f32);
+    let text = "[input.v]\npath = \"v.npy\"\nslope = nan\n[output.o]\npath = \"o.zarr\"\nfrom = \"v\"\n[output.p]\npath = \"p.zarr\"\nfrom = \"v\"\n";
+    std::fs::write(f.join("c.toml"), text).unwrap();
+    assert_eq!(call(f, &["run", "c.toml", "-q"]).0, 0, "slope NaN means 1");
+    std::fs::remove_dir_all(f.join("p.zarr")).unwrap();
+    std::fs::create_dir(f.join("p.zarr")).unwrap();
+    std::fs::write(f.join("p.zarr/notes.txt"), "mine").unwrap();
+    let (code, _, err) = call(f, &["run", "c.toml", "-q", "--overwrite"]);
+    assert!(code == 2 && err.contains("p.zarr"), "{code}: {err}");
+    assert!(f.join("o.zarr/zarr.json").exists() && f.join("p.zarr/notes.txt").exists());
+}
+
+#[test]
+fn a_histogram_beside_an_infinity_counts_every_finite_value() {
+    let folder = tempfile::tempdir().unwrap();
+    npy(&folder.path().join("v.npy"), [4, 5, 6], |i| match i {
+        7 => f32::INFINITY,
+        9 => f32::NAN,
+        i => i as f32,
+    });
+    let stats = &json(folder.path(), &["info", "v.npy", "--json", "--stats"])["stats"];
+    let counts = stats["histogram"]["counts"].as_array().unwrap();
+    assert_eq!(counts.iter().map(|c| c.as_u64().unwrap()).sum::<u64>(), 118, "{stats}");
+    assert_eq!((&stats["count"], &stats["histogram"]["hi"]), (&118.into(), &119.0.into()), "{stats}");
+}

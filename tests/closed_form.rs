@@ -86,3 +86,15 @@ fn a_linear_ramp_has_its_slope_everywhere_inside() {
     let flat = stage(&v, "op = 'gaussian'\nsigma = 1.0");
     assert!((flat[[7, 7, 7]] - f64::from(v[[7, 7, 7]])).abs() < 1e-4);
 }
+
+#[test]
+fn directions_weighed_by_the_normal_make_one_openness() {
+    // Values fall along z and so does the normal: no voxel in the open half is denser.
+    let v = Array3::from_shape_fn((14, 15, 16), |(z, _, _)| -(z as f32));
+    let o = stage(&v, "op = 'obscurance'\ndirections = 12\nmax_distance = 3\nweight_by_normal = true");
+    assert!(
+        o.iter().all(|o| (o - 1.0).abs() < 1e-6),
+        "the openness, not the gradient that weighs it: {:?}",
+        o[[7, 7, 7]]
+    );
+}

@@ -189,3 +189,105 @@ fn a_corrupt_chunk_ends_the_run_with_its_name_and_keeps_what_was_finished() {
     let root = fs::read_to_string(dir.path().join("out/second.zarr/zarr.json")).unwrap_or_default();
     assert!(!root.contains("complete"), "{root}");
 }
+
+/// A small file system of its own, gone with the value. `None` where this user may not mount.
+struct Disk(std::path::PathBuf);
+
+impl Disk {
+    fn mount(at: &Path, options: &str) -> Option<Disk> {
+        fs::create_dir_all(at).unwrap();
+        let done = Command::new("mount").args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(at).output();
+        done.is_ok_and(|o| o.status.success()).then(|| Disk(at.to_path_buf()))
+    }
+
+    fn grow(&self, size: &str) {
+        let done = Command::new("mount").args(["-o", &format!("remount,size={size}")]).arg(&self.0).status();
+        assert!(done.unwrap().success(), "remount");
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
+    }
+}
+
+#[test]
+fn a_full_disk_keeps_what_was_finished_and_resumes_when_there_is_room() {
+    let reference = folder();
+    run(reference.path(), CONFIG, &[]);
+    let expected = decoded(reference.path());
+    let dir = folder();
+    let out = dir.path().join("out");
+    // Room for some of the five tasks (their files take about 17 MiB), and for nothing but the first files.
+    for size in ["12m", "6m"] {
+        let Some(disk) = Disk::mount(&out, &format!("size={size}")) else {
+            eprintln!("SKIPPED: no file system can be mounted here (root is needed), so no disk can run full");
+            return;
+        };
+        let failed = start(dir.path()).output().unwrap();
+        let message = String::from_utf8_lossy(&failed.stderr);
+        assert_eq!(failed.status.code(), Some(1), "{size}: {message}");
+        assert!(message.contains("out/") && message.contains("No space left"), "{size}: {message}");
+        assert!(!message.contains("panicked") && !message.contains("internal error"), "{message}");
+        // Whatever lies under a final name decodes, and is either not there yet (0; 255 of openness) or final.
+        for (name, want) in OUTPUTS.iter().zip(&expected).filter(|(name, _)| name.ends_with("zarr")) {
+            let have = decode(&out.join(name));
+            let (level, (_, voxels)) = have.iter().next().unwrap();
+            let fault = voxels
+                .iter()
+                .zip(&want[level].1)
+                .position(|(a, b)| a != b && ![0.0, 255.0].contains(&f64::from_bits(*a)));
+            assert_eq!(fault, None, "{size}: {name} {level}");
+        }
+        assert!(!out.join("flat.npy").exists(), "an unfinished file has no final name");
+        let done = fs::read(out.join("flat.npy.occlude/tasks.log")).unwrap_or_default().len();
+        disk.grow("200m");
+        let resumed = start(dir.path()).output().unwrap();
+        assert!(resumed.status.success(), "{size}: {}", String::from_utf8_lossy(&resumed.stderr));
+        let report: serde_json::Value =
+            serde_json::from_slice(&fs::read(dir.path().join("report.json")).unwrap()).unwrap();
+        let again = report["bricks"]["resumed"].as_u64().unwrap();
+        assert_eq!(done > 0, again > 0, "{size}: {done} bytes of marks, {again} bricks found done");
+        for (name, (a, b)) in OUTPUTS.iter().zip(expected.iter().zip(decoded(dir.path()))) {
+            assert_same(&format!("{name} after a full disk of {size}"), a, &b);
+        }
+        println!("{size}: {again} bricks were kept; {}", message.trim());
+    }
+}
+
+#[test]
+fn a_vanished_chunk_is_not_taken_for_one_that_was_never_stored() {
+    for shard in ["16", "'none'"] {
+        let dir = tempfile::tempdir().unwrap();
+        let shape = [16, 32, 64];
+        write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+        let make = format!(
+            "[input.a]\npath = 'vol.npy'\n[output.z]\npath = 'in.zarr'\nfrom = 'a'\nchunk = 8\nshard = {shard}\nlevels = 1\n"
+        );
+        let text = "[run]\nbrick = 8\n[input.a]\npath = 'in.zarr'\n[stage.s]\nop = 'box'\ninput = 'a'\nradius = 1\n\
+                    [output.o]\npath = 'o.npy'\nfrom = 's'\n";
+        let array = dir.path().join("in.zarr");
+        let chunk = array.join("0/c/0/0/0");
+        let vanish: [&dyn Fn(); 3] = [
+            &|| fs::rename(&array, dir.path().join("elsewhere.zarr")).unwrap(),
+            &|| fs::remove_file(&chunk).unwrap(),
+            &|| fs::remove_dir_all(array.join("0/c")).unwrap(),
+        ];
+        for (i, vanish) in vanish.iter().enumerate() {
+            run(dir.path(), &make, &[]);
+            let config = parse(dir.path(), text, &[]);
+            let options = RunOptions { overwrite: true, ..Default::default() };
+            let session = occlude::run::Session::open(&config, &options, &occlude::run::Silent).unwrap();
+            // Clocks of file systems tick every few milliseconds.
+            std::thread::sleep(Duration::from_millis(30));
+            vanish();
+            let error = session.run_tasks(&session.open_tasks()).unwrap_err();
+            assert_eq!(error.exit_code(), 1, "{error}");
+            assert!(error.to_string().contains("in.zarr/0/c/0"), "{shard} {i}: {error}");
+            drop(session);
+            let _ = fs::remove_dir_all(&array);
+            let _ = fs::remove_dir_all(dir.path().join("elsewhere.zarr"));
+        }
+    }
+}

@@ -102,3 +102,82 @@ fn channels_that_nobody_reads_are_not_planned() {
     assert_eq!(steps.len(), 1, "one pass serves both stages: {text}");
     assert_eq!(steps[0]["makes"], "again.openness, s.mean".to_string().as_str(), "{text}");
 }
+
+#[test]
+fn obscurance_keeps_its_channels_apart_from_colours_and_normals() {
+    let dir = tempfile::tempdir().unwrap();
+    island(dir.path());
+    let text = "[input.a]\npath = 'vol.npy'\n[stage.tf]\nop = 'transfer'\ninput = 'a'\npoints = [[0, 0, 0, 0, 0], [9, 1, 1, 1, 1]]\n\
+                [stage.o]\nop = 'obscurance'\ninput = 'a'\ndirections = 12\nmax_distance = 4\ncolour = 'tf.rgb'\n";
+    let open = "[output.o]\npath = 'o.zarr'\nfrom = 'o'\n";
+    let (_, plan) = occlude::plan::explain(&parse(dir.path(), &format!("{text}{open}"), &[])).unwrap();
+    assert_eq!(plan["steps"].as_array().unwrap().len(), 1, "nobody reads rgb, so no colour is made: {plan}");
+
+    let both = format!("{text}weight_by_normal = true\n{open}[output.c]\npath = 'c.zarr'\nfrom = 'o.rgb'\n");
+    run(dir.path(), &both, &["run.region=[[40, 56], [40, 56], [40, 56]]"]);
+    let parts = |name: &str| decode(&dir.path().join(name)).keys().filter(|k| k.starts_with("level 0")).count();
+    assert_eq!((parts("o.zarr"), parts("c.zarr")), (1, 3));
+}
+
+#[test]
+fn the_plan_knows_what_will_be_skipped_for_missing_chunks_and_impossible_masks() {
+    let dir = tempfile::tempdir().unwrap();
+    island(dir.path());
+    // A pyramid of the island alone: chunks of zeros are not stored, in shards or as files.
+    for shard in ["32", "'none'"] {
+        let text = format!(
+            "[input.a]\npath = 'vol.npy'\n[output.z]\npath = 'z.zarr'\nfrom = 'a'\nchunk = 16\nshard = {shard}\n"
+        );
+        run(dir.path(), &text, &[]);
+        for (body, cause) in [
+            ("", "missing_chunk"),
+            ("where = { input = 'a', min = 1 }\n", "where"),
+            ("where = { input = 'a', iso = [0.5], band = 1.0 }\n", "where"),
+            ("where = { input = 'a', min = 70000 }\n", "where"),
+        ] {
+            let text = format!(
+                "[run]\nbrick = 16\n[input.a]\npath = 'z.zarr'\n[stage.s]\nop = 'box'\ninput = 'a'\nradius = 1\n{body}\
+                 [output.o]\npath = 'o.zarr'\nfrom = 's.mean'\nchunk = 16\n"
+            );
+            let (said, plan) = occlude::plan::explain(&parse(dir.path(), &text, &[])).unwrap();
+            let report = run(dir.path(), &text, &[]);
+            let known = plan["groups"][0]["skippable"]["causes"][cause].as_u64().unwrap();
+            // The band of an isosurface reaches over the chunks' edges, where only voxels tell.
+            let (run, all) = (skipped(&report, cause), !body.contains("iso"));
+            assert!(known > 0 && known <= run && (!all || known == run), "{body}: {:?} {said}", report.bricks.skipped);
+            let share = plan["skippable_share"].as_f64().unwrap();
+            assert_eq!(share, known as f64 / report.bricks.total as f64, "{said}");
+            assert!(said.contains(&format!("skipped without reading: {known} of 216 bricks")), "{said}");
+        }
+    }
+    let text = format!("[run]\nregion = [[0, 96], [0, 48], [0, 96]]\n[input.a]\npath = 'vol.npy'\n{STAGE}");
+    let (said, plan) = occlude::plan::explain(&parse(dir.path(), &text, &[])).unwrap();
+    assert_eq!(plan["groups"][0]["skippable"]["outside_region"], 0.5);
+    assert!(said.contains("50.0 % of the volume"), "{said}");
+}
+
+#[test]
+fn flat_chunks_that_the_cache_cannot_hold_are_decoded_once_into_scratch() {
+    let dir = tempfile::tempdir().unwrap();
+    // Noise above planes of zeros, whose chunks are not stored.
+    let shape = [70, 250, 260];
+    let v = fill(shape, |z, y, x| if z < 20 { 0 } else { hash(3, ((z * 250 + y) * 260 + x) as u64) as u16 });
+    write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&v));
+    let stage = "[stage.s]\nop = 'box'\ninput = 'a'\nradius = 2\n[output.o]\npath = 'o.npy'\nfrom = 's.variance'\n";
+    run(dir.path(), &format!("[input.a]\npath = 'vol.npy'\n{stage}"), &[]);
+    let expected = decode(&dir.path().join("o.npy"));
+    for chunk in ["[1, 250, 260]", "[1, 128, 260]", "[2, 100, 130]"] {
+        let planes = format!(
+            "[input.a]\npath = 'vol.npy'\n[output.z]\npath = 'z.zarr'\nfrom = 'a'\nlevels = 1\nchunk = {chunk}\nshard = 'none'\n"
+        );
+        run(dir.path(), &planes, &[]);
+        let text = format!("[run]\nmemory = '32MiB'\nthreads = 1\nbrick = 32\n[input.a]\npath = 'z.zarr'\n{stage}");
+        let flat = chunk.starts_with("[1");
+        let (_, plan) = occlude::plan::explain(&parse(dir.path(), &text, &[])).unwrap();
+        assert_eq!(plan["scratch_bytes"].as_u64().unwrap() > 0, flat, "{chunk}");
+        run(dir.path(), &text, &[]);
+        assert_same(chunk, &expected, &decode(&dir.path().join("o.npy")));
+        let (_, plan) = occlude::plan::explain(&parse(dir.path(), &text, &["run.memory='2GiB'"])).unwrap();
+        assert_eq!(plan["scratch_bytes"], 0, "a large budget holds the stack of {chunk}");
+    }
+}

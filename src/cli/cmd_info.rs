@@ -99,8 +99,9 @@ fn of_component(volume: &Volume, component: usize, cancel: &Cancel) -> Result<St
             fine.add(plane);
         }
     })?;
-    let ends = if moments.n == 0 { (0.0, 0.0) } else { (finite(moments.min, &moments), finite(moments.max, &moments)) };
-    let mut histogram = Histogram::new(ends.0, ends.1, BINS);
+    // Infinities have no bin.
+    let ends = if moments.n == 0 { [0.0, 0.0] } else { moments.finite };
+    let mut histogram = Histogram::new(ends[0], ends[1], BINS);
     match fine {
         Some(fine) => {
             let width = (fine.hi - fine.lo) / fine.counts.len() as f64;
@@ -112,11 +113,6 @@ fn of_component(volume: &Volume, component: usize, cancel: &Cancel) -> Result<St
         None => pass(volume, component, cancel, &mut |plane| histogram.add(plane))?,
     }
     Ok(Statistics { moments, histogram })
-}
-
-/// An end of the histogram: infinities have no bin.
-fn finite(v: f64, moments: &Moments) -> f64 {
-    if v.is_finite() { v } else { moments.mean }
 }
 
 fn pass(volume: &Volume, component: usize, cancel: &Cancel, f: &mut dyn FnMut(&[f64])) -> Result<()> {

@@ -321,7 +321,7 @@ fn variant(args: &ParetoArgs, job: &Job, settings: &Table, path: &Path) -> Resul
 /// Cost of a run: the median of so many, after one to warm up where there are several.
 fn timed(config: &Config, repeat: u32, cancel: &Cancel) -> Result<Cost> {
     let options = RunOptions { overwrite: true, cancel: cancel.clone(), ..RunOptions::default() };
-    let run = || run::run(config, &options, &Silent).map_err(|e| e.located(&config.file, None));
+    let run = || run::run(config, &options, &Silent).map_err(|e| config.locate(e));
     if repeat > 1 {
         run()?;
     }

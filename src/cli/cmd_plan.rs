@@ -7,6 +7,6 @@ use crate::Result;
 /// Prints the plan.
 pub fn run(args: &PlanArgs) -> Result<()> {
     let config = load(&args.config, &[])?;
-    let (text, json) = crate::plan::explain(&config).map_err(|e| e.located(&config.file, None))?;
+    let (text, json) = crate::plan::explain(&config).map_err(|e| config.locate(e))?;
     if args.json { messages::result_json(&json) } else { messages::result(&text) }
 }

@@ -27,7 +27,7 @@ pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
     let progress = Shown::new(quiet);
     let report = run::run(&config, &options, &progress);
     progress.finish();
-    let report = report.map_err(|e| e.located(&config.file, None))?;
+    let report = report.map_err(|e| config.locate(e))?;
     if let Some(path) = &args.report {
         let json = serde_json::to_vec_pretty(&report).map_err(|e| Error::Failed(format!("report: {e}")))?;
         write_whole(path, &json)?;

@@ -29,7 +29,7 @@ use args::{Cli, Command, ConfigArgs, DeviceArg};
 /// config, 130 interrupted).
 pub fn main() -> ExitCode {
     messages::restore_sigpipe();
-    messages::hook_panics(std::env::args().any(|a| a == "-v" || a == "--verbose"));
+    messages::hook_panics(std::env::args_os().any(|a| a == "-v" || a == "--verbose"));
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {

@@ -11,11 +11,14 @@ pub struct Moments {
     pub m2: f64,
     pub min: f64,
     pub max: f64,
+    /// Least and largest finite value: the ends of a histogram.
+    pub finite: [f64; 2],
 }
 
 impl Default for Moments {
     fn default() -> Moments {
-        Moments { n: 0, missing: 0, infinite: 0, mean: 0.0, m2: 0.0, min: f64::INFINITY, max: f64::NEG_INFINITY }
+        let (min, max) = (f64::INFINITY, f64::NEG_INFINITY);
+        Moments { n: 0, missing: 0, infinite: 0, mean: 0.0, m2: 0.0, min, max, finite: [min, max] }
     }
 }
 
@@ -36,6 +39,7 @@ impl Moments {
             } else {
                 m.n += 1;
                 sum += v;
+                m.finite = [m.finite[0].min(v), m.finite[1].max(v)];
             }
         }
         if m.n == 0 {
@@ -51,6 +55,7 @@ impl Moments {
         let n = self.n + other.n;
         let (missing, infinite) = (self.missing + other.missing, self.infinite + other.infinite);
         let (min, max) = (self.min.min(other.min), self.max.max(other.max));
+        let finite = [self.finite[0].min(other.finite[0]), self.finite[1].max(other.finite[1])];
         if n == 0 {
             return Moments { missing, infinite, min, max, ..Moments::default() };
         }
@@ -58,7 +63,7 @@ impl Moments {
         let delta = other.mean - self.mean;
         let mean = if self.n == 0 { other.mean } else { self.mean + delta * share };
         let m2 = self.m2 + other.m2 + if self.n == 0 { 0.0 } else { delta * delta * share * self.n as f64 };
-        Moments { n, missing, infinite, mean, m2, min, max }
+        Moments { n, missing, infinite, mean, m2, min, max, finite }
     }
 
     /// Population variance; NaN of nothing.

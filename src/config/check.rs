@@ -3,9 +3,9 @@
 use std::path::{Component, Path, PathBuf};
 
 use super::section::error;
-use super::{Config, InputKind, Op, Output, OutputDType, OutputRange, Ref, StageNode, op_channels};
-use crate::Result;
+use super::{Config, InputKind, Op, Output, OutputDType, OutputRange, Place, Ref, StageNode, op_channels};
 use crate::stage::Reduce;
+use crate::{Error, Result};
 
 /// Everything that a config can be refused for after its tables have been read.
 pub fn check(config: &Config) -> Result<()> {
@@ -34,6 +34,28 @@ impl StageNode {
 }
 
 impl Config {
+    /// Gives an error of a later step (planning, opening) the file and the line of the key that it names, as far as the
+    /// file has that key; else the line of the table.
+    pub fn locate(&self, error: Error) -> Error {
+        let Error::Config { file: None, line: None, key, .. } = &error else { return error };
+        let line = self.line_of(key);
+        error.located(&self.file, line)
+    }
+
+    fn line_of(&self, key: &str) -> Option<usize> {
+        let places = std::iter::once(&self.run.place)
+            .chain(self.inputs.iter().map(|i| &i.place))
+            .chain(self.stages.iter().map(|s| &s.place))
+            .chain(self.outputs.iter().map(|o| &o.place));
+        // Names may hold dots: the longest table wins.
+        let within =
+            |place: &&Place| key == place.key || key.strip_prefix(&place.key).is_some_and(|r| r.starts_with('.'));
+        let place = places.filter(within).max_by_key(|p| p.key.len())?;
+        let rest = key.get(place.key.len() + 1..).unwrap_or_default();
+        let named = |k: &str| rest == k || rest.strip_prefix(k).is_some_and(|r| r.starts_with('.'));
+        place.lines.iter().find(|(k, _)| named(k)).map(|(_, line)| *line).or(place.line)
+    }
+
     pub fn stage(&self, name: &str) -> Option<&StageNode> {
         self.stages.iter().find(|s| s.name == name)
     }

@@ -30,12 +30,20 @@ pub fn read(name: &str, node: &Node, base: &Path) -> Result<Input> {
         spacing: r.opt("spacing", read::spacing)?,
         unit: r.opt("unit", read::unit)?,
         origin: r.opt("origin", read::position)?,
-        slope: r.opt_number("slope")?,
+        slope: r.opt("slope", slope)?,
         intercept: r.opt_number("intercept")?,
         nodata: r.opt("nodata", nodata)?,
         kind,
         place: r.place,
     })
+}
+
+/// A factor; NaN means "no scaling", as it does in a NIfTI header.
+fn slope(node: &Node) -> Result<f64, read::Bad> {
+    match node.value {
+        super::tree::Value::Float(v) if v.is_nan() => Ok(v),
+        _ => read::number(node),
+    }
 }
 
 /// A stored value; NaN is what floats use anyway.

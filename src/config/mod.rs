@@ -24,7 +24,7 @@ use std::path::{Path, PathBuf};
 pub use hash::config_hash;
 pub use keys::op_channels;
 pub use model::*;
-pub use provenance::provenance;
+pub use provenance::{provenance, stage_constants, stage_parameters};
 pub use schema::schema;
 
 use crate::{Error, Result};

@@ -62,7 +62,7 @@ fn property(key: &Key, op: &str) -> Value {
 }
 
 /// A default as JSON.
-fn default_value(text: &str) -> Value {
+pub(super) fn default_value(text: &str) -> Value {
     let table = tree::parse(&format!("v = {text}")).map(|t| read::toml_table(&t));
     let value = table.ok().and_then(|t| serde_json::to_value(&t["v"]).ok());
     value.unwrap_or_else(|| json!(text))

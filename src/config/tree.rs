@@ -211,7 +211,14 @@ impl fmt::Display for Node {
             Value::Float(v) => write!(f, "{v:?}"),
             Value::Bool(b) => write!(f, "{b}"),
             Value::Time(t) => write!(f, "{t}"),
-            Value::Table(_) => f.write_str("a table"),
+            Value::Table(entries) => {
+                let shown = |(k, n): &(String, Node)| match n.value {
+                    Value::Table(_) => format!("{k} = {{..}}"),
+                    _ => format!("{k} = {n}"),
+                };
+                let first: Vec<String> = entries.iter().take(4).map(shown).collect();
+                write!(f, "a table {{ {}{} }}", first.join(", "), if entries.len() > 4 { ", ..." } else { "" })
+            }
             Value::List(items) => {
                 let shown: Vec<String> = items.iter().take(8).map(Node::to_string).collect();
                 write!(f, "[{}{}]", shown.join(", "), if items.len() > 8 { ", ..." } else { "" })
@@ -223,6 +230,13 @@ impl fmt::Display for Node {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn tables_are_shown_short() {
+        let t = parse("b = { constant = inf }\nc = { a = 1, b = { x = 2 }, c = 3, d = 4, e = 5 }\n").unwrap();
+        assert_eq!(find(&t, "b").unwrap().to_string(), "a table { constant = inf }");
+        assert_eq!(find(&t, "c").unwrap().to_string(), "a table { a = 1, b = {..}, c = 3, d = 4, ... }");
+    }
 
     #[test]
     fn lines_are_those_of_the_keys() {

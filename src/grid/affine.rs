@@ -12,10 +12,10 @@ impl Affine {
 
     /// A slope of 0 or NaN means "no scaling", as NIfTI has it; a NaN intercept counts as 0.
     pub fn new(slope: f64, intercept: f64) -> Affine {
-        if slope == 0.0 || !slope.is_finite() || !intercept.is_finite() {
+        if slope == 0.0 || !slope.is_finite() {
             Affine::IDENTITY
         } else {
-            Affine { slope, intercept }
+            Affine { slope, intercept: if intercept.is_finite() { intercept } else { 0.0 } }
         }
     }
 

@@ -48,13 +48,16 @@ pub fn convert_row<S: Voxel, D: Output>(level: Level, src: &[S], mapping: Mappin
     }
 }
 
-/// `code = clamp((v * half - lo) * scale, low, high)` before rounding.
+/// `code = clamp((v * half - lo) / width * top, low, high)` before rounding: the formula as it is written down, so that a
+/// value half way between two codes goes where anyone who recomputes it puts it. (A single factor `top / width` moved 45
+/// of [0, 50] from 229.5 to just below.)
 #[derive(Debug, Clone, Copy)]
 struct Linear {
     /// 0.5 where `hi - lo` would overflow, else 1.
     half: f64,
     lo: f64,
-    scale: f64,
+    width: f64,
+    top: f64,
     low: f64,
     high: f64,
     /// What NaN becomes, inside the type's range.
@@ -66,10 +69,10 @@ impl Linear {
         let (least, high) = dtype.range();
         let fill = if mapping.fill.is_nan() { 0.0 } else { mapping.fill.clamp(least, high) };
         match mapping.range {
-            None => Linear { half: 1.0, lo: 0.0, scale: 1.0, low: least, high, fill },
+            None => Linear { half: 1.0, lo: 0.0, width: 1.0, top: 1.0, low: least, high, fill },
             Some([lo, hi]) => {
                 let half = if (hi - lo).is_finite() { 1.0 } else { 0.5 };
-                Linear { half, lo: lo * half, scale: high / (hi * half - lo * half), low: 0.0, high, fill }
+                Linear { half, lo: lo * half, width: hi * half - lo * half, top: high, low: 0.0, high, fill }
             }
         }
     }
@@ -103,8 +106,8 @@ const ROUNDER: f64 = 6755399441055744.0;
 #[inline(always)]
 fn quantise_inner<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
     // The usual case, [0, 1] or no range, without the parts that do nothing to it.
-    if map.half == 1.0 && map.lo == 0.0 {
-        quantise_loop(src, Linear { half: 1.0, lo: 0.0, ..map }, dst)
+    if map.half == 1.0 && map.lo == 0.0 && map.width == 1.0 {
+        quantise_loop(src, Linear { half: 1.0, lo: 0.0, width: 1.0, ..map }, dst)
     } else {
         quantise_loop(src, map, dst)
     }
@@ -112,10 +115,10 @@ fn quantise_inner<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
 
 #[inline(always)]
 fn quantise_loop<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
-    let Linear { half, lo, scale, low, high, fill } = map;
+    let Linear { half, lo, width, top, low, high, fill } = map;
     for (d, s) in dst.iter_mut().zip(src) {
         let v = s.to_f64();
-        let t = (v * half - lo) * scale;
+        let t = (v * half - lo) / width * top;
         // Written as compares, not `clamp`, so that they become one instruction each; NaN becomes `low`.
         let t = if t > low { t } else { low };
         let t = if t < high { t } else { high };
@@ -151,7 +154,7 @@ fn reference<D: Voxel>(v: f64, mapping: Mapping) -> D {
         None => D::from_f64(v),
         Some([lo, hi]) => {
             let max = D::DTYPE.range().1;
-            D::from_f64(((v - lo) * (max / (hi - lo))).clamp(0.0, max))
+            D::from_f64(((v - lo) / (hi - lo) * max).clamp(0.0, max))
         }
     }
 }
@@ -227,6 +230,14 @@ mod tests {
         let shape = [1, 1, 2];
         convert(AnyView::F32(View::dense(&half, shape)), unit, AnyViewMut::U8(ViewMut::dense(&mut ties, shape)));
         assert_eq!(ties, [128, 128], "127.5 rounds to the even 128");
+    }
+
+    #[test]
+    fn a_value_half_way_between_two_codes_goes_to_the_even_one() {
+        let mapping = Mapping { range: Some([0.0, 50.0]), fill: 0.0 };
+        let mut codes = [0u8; 3];
+        convert_row(Level::detect(), &[45u8, 5, 15], mapping, &mut codes);
+        assert_eq!(codes, [230, 26, 76], "229.5, 25.5 and 76.5");
     }
 
     #[test]

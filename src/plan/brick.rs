@@ -171,24 +171,26 @@ fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
     let mut probe = group.clone();
     probe.brick.shape = shape;
     let need = bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.threads as u64;
-    Error::config(
+    config.locate(Error::config(
         "run.memory",
         format!(
             "{} is too little for one brick: the smallest, {shape:?} voxels (z, y, x), with its halo, results and scratch \
-             takes {}; give at least memory = \"{}MiB\"",
+             takes {}, beside {} that every run holds; give at least memory = \"{}MiB\"",
             mib(plan.memory),
             mib(bytes),
+            mib(need - bytes),
             need.div_ceil(1 << 20)
         ),
-    )
-    .located(&config.file, config.run.place.line)
+    ))
 }
 
 /// A size for people.
 pub fn mib(bytes: u64) -> String {
     if bytes >= 10 << 30 {
         format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64)
-    } else {
+    } else if bytes >= 1 << 20 || bytes == 0 {
         format!("{:.1} MiB", bytes as f64 / (1 << 20) as f64)
+    } else {
+        format!("{:.1} KiB", bytes as f64 / 1024.0)
     }
 }

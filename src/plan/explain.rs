@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 
 use super::brick::mib;
 use super::graph::{Producer, Step};
+use super::skips::{self, Known};
 use super::tasks::input_halo;
 use super::{Group, Plan};
 use crate::Result;
@@ -18,10 +19,11 @@ pub fn explain(config: &Config) -> Result<(String, Value)> {
     let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
     let mut gpu = None;
     let plan = Plan::new(config, &infos, &mut || crate::gpu::find(config.run.device, &mut gpu))?;
-    Ok((text(config, &plan, &sources), describe(config, &plan, &sources)))
+    let skips = plan.groups.iter().map(|g| skips::known(&plan, g, &sources)).collect::<Result<Vec<_>>>()?;
+    Ok((text(config, &plan, &sources, &skips), describe(config, &plan, &sources, &skips)))
 }
 
-fn text(config: &Config, plan: &Plan, sources: &[Source]) -> String {
+fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>]) -> String {
     let mut out = String::new();
     let w = &mut out;
     for (input, source) in config.inputs.iter().zip(sources) {
@@ -44,8 +46,9 @@ fn text(config: &Config, plan: &Plan, sources: &[Source]) -> String {
             let _ = writeln!(w, "  one pass for {}", step.stages.join(", "));
         }
     }
-    for group in &plan.groups {
+    for (group, known) in plan.groups.iter().zip(skips) {
         group_text(w, plan, group);
+        skips_text(w, group, known.as_ref());
     }
     for output in &plan.outputs {
         let spec = &output.spec;
@@ -91,6 +94,45 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
     }
 }
 
+/// Share of all bricks that are known to be skipped.
+fn skippable(plan: &Plan, skips: &[Option<Known>]) -> f64 {
+    let skipped: u64 = skips.iter().flatten().map(Known::bricks).sum();
+    skipped as f64 / plan.groups.iter().map(Group::brick_count).sum::<usize>() as f64
+}
+
+/// The part of the volume that lies outside `region`.
+fn outside(group: &Group) -> f64 {
+    1.0 - group.region.voxels() as f64 / group.shape.iter().product::<usize>() as f64
+}
+
+fn skips_text(w: &mut String, group: &Group, known: Option<&Known>) {
+    let bricks = group.brick_count();
+    let _ = match known {
+        Some(k) => writeln!(
+            w,
+            "  known to be skipped without reading: {} of {bricks} bricks, {:.1} % (where: {}, missing chunks: {})",
+            k.bricks(),
+            100.0 * k.bricks() as f64 / bricks as f64,
+            k.masked,
+            k.missing
+        ),
+        None => writeln!(w, "  known to be skipped without reading: not worked out for {bricks} bricks"),
+    };
+    let outside = outside(group);
+    if outside > 0.0 {
+        let _ = writeln!(w, "  outside the region, not visited: {:.1} % of the volume", 100.0 * outside);
+    }
+}
+
+fn skips_json(group: &Group, known: Option<&Known>) -> Value {
+    let outside = outside(group);
+    let Some(k) = known else { return json!({ "share": null, "outside_region": outside }) };
+    json!({
+        "share": k.bricks() as f64 / group.brick_count() as f64, "bricks": k.bricks(),
+        "causes": { "where": k.masked, "missing_chunk": k.missing }, "outside_region": outside,
+    })
+}
+
 fn reads(plan: &Plan, step: &Step) -> String {
     let mut names: Vec<&str> = step.inputs.iter().map(|&w| plan.graph.wires[w].name.as_str()).collect();
     names.extend(step.mask.as_ref().map(|m| plan.graph.wires[m.wire].name.as_str()));
@@ -124,7 +166,7 @@ fn traffic(plan: &Plan, sources: &[Source]) -> (u64, u64) {
     (inputs.iter().map(size).sum(), plan.outputs.iter().map(|o| written(&o.spec)).sum())
 }
 
-fn describe(config: &Config, plan: &Plan, sources: &[Source]) -> Value {
+fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>]) -> Value {
     let (read, write) = traffic(plan, sources);
     let inputs: Vec<Value> = config
         .inputs
@@ -153,8 +195,10 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source]) -> Value {
     let groups: Vec<Value> = plan
         .groups
         .iter()
-        .map(|g| {
+        .zip(skips)
+        .map(|(g, known)| {
             json!({
+                "skippable": skips_json(g, known.as_ref()),
                 "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
                 "brick_bytes": g.brick.bytes, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
                 "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache,
@@ -173,7 +217,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source]) -> Value {
                 .iter()
                 .map(|l| json!({ "shape": l.shape, "scale": l.scale, "translation": l.translation }))
                 .collect();
-            json!({ "name": o.spec.name, "path": o.spec.path, "dtype": o.spec.dtype.numpy_name(), "levels": levels,
+            json!({ "name": o.spec.name, "path": o.spec.path.display().to_string(), "dtype": o.spec.dtype.numpy_name(), "levels": levels,
                     "chunk": o.spec.chunk, "shard": o.spec.shard, "fill": o.spec.fill.to_string() })
         })
         .collect();
@@ -190,6 +234,8 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source]) -> Value {
         "bytes_to_read": read,
         "bytes_to_write": write,
         "tasks": plan.task_count(),
+        "bricks": plan.groups.iter().map(Group::brick_count).sum::<usize>(),
+        "skippable_share": skippable(plan, skips),
         "warnings": plan.warnings,
     })
 }

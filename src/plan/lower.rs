@@ -109,6 +109,7 @@ impl Lowering<'_> {
     fn want(&mut self, reference: &Ref, place: &Place) -> Result<()> {
         let Target::Stage(stage, channel) = self.target(reference, place)? else { return Ok(()) };
         let first = self.wanted[stage].is_empty();
+        let first_rgb = channel == "rgb" && !self.wanted[stage].contains(&channel);
         if !self.wanted[stage].contains(&channel) {
             self.wanted[stage].push(channel);
         }
@@ -118,9 +119,10 @@ impl Lowering<'_> {
         if companion && !self.wanted[stage].contains(&"mean") {
             self.wanted[stage].push("mean");
         }
-        if first {
-            let node = &self.config.stages[stage];
-            for (_, input) in node.reads() {
+        let node = &self.config.stages[stage];
+        for (key, input) in node.reads() {
+            // A colour bleeds into the channel rgb alone.
+            if if key == "colour" { first_rgb } else { first } {
                 self.want(input, &node.place)?;
             }
         }
@@ -181,7 +183,8 @@ impl Lowering<'_> {
             return Ok(());
         }
         let node = self.config.stages[index].clone();
-        self.lower_op(index, &node, &wanted).map_err(|e| e.located(&self.config.file, node.place.line))
+        self.lower_op(index, &node, &wanted)
+            .map_err(|e| self.config.locate(e).located(&self.config.file, node.place.line))
     }
 
     fn lower_op(&mut self, index: usize, node: &StageNode, wanted: &[&'static str]) -> Result<()> {
@@ -382,8 +385,9 @@ impl Lowering<'_> {
         let src = self.wire(&op.input, &node.place)?;
         let max_distance =
             lengths::distance(&op.max_distance, self.lattice(src), &format!("{}.max_distance", node.place.key))?;
-        let colour = op.colour.as_ref().map(|c| self.wire(c, &node.place)).transpose()?;
-        if wanted.contains(&"rgb") && colour.is_none() {
+        let bleeds = wanted.contains(&"rgb");
+        let colour = op.colour.as_ref().filter(|_| bleeds).map(|c| self.wire(c, &node.place)).transpose()?;
+        if bleeds && colour.is_none() {
             return Err(Error::config(
                 format!("{}.colour", node.place.key),
                 "the channel rgb needs `colour = STAGE`, a transfer stage whose rgb bleeds",
@@ -398,7 +402,6 @@ impl Lowering<'_> {
                 format!("\"{name}\" has {} component(s); an rgb channel has 3", self.out.graph.wires[c].components),
             ));
         }
-        let colour = colour.filter(|_| wanted.contains(&"rgb"));
         let normal = if op.weight_by_normal { Some(self.normal(index, node, src)?) } else { None };
         let wire = &self.out.graph.wires[src];
         let params = obscurance::ObscuranceParams {
@@ -536,6 +539,8 @@ impl Lowering<'_> {
             }
             "rgb" => (most, ["red", "green", "blue"].map(String::from).to_vec()),
             "vector" => (3, ["z", "y", "x"].map(String::from).to_vec()),
+            // Colour and normal have three components each; the openness that they bear on has one.
+            "openness" if matches!(node.op, Op::Obscurance(_)) => (1, src.component_names.clone()),
             _ => (most, src.component_names.clone()),
         };
         let extreme = matches!(channel, "min" | "max") && matches!(node.op, Op::Box { .. }) && src.affine.is_identity();

@@ -8,6 +8,7 @@ pub mod lengths;
 pub mod lower;
 pub mod memory;
 pub mod outputs;
+pub mod skips;
 pub mod tasks;
 
 use graph::{GlobalId, Graph, StepId, WireId};

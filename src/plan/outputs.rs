@@ -51,7 +51,8 @@ pub fn plan_outputs(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered
     (0..config.outputs.len())
         .map(|i| {
             let output = &config.outputs[i];
-            plan_output(config, infos, lowered, i).map_err(|e| e.located(&config.file, output.place.line))
+            plan_output(config, infos, lowered, i)
+                .map_err(|e| config.locate(e).located(&config.file, output.place.line))
         })
         .collect()
 }
@@ -240,7 +241,7 @@ fn region_of(config: &Config, shape: [usize; 3]) -> Result<Region> {
     let region = Region::new(lo, hi);
     if region.is_empty() || !whole.contains(&region) {
         let message = format!("{r:?} does not lie inside the volume of {shape:?} voxels (z, y, x; half-open)");
-        return Err(Error::config("run.region", message).located(&config.file, config.run.place.line));
+        return Err(config.locate(Error::config("run.region", message)));
     }
     Ok(region)
 }

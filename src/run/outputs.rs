@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::assemble::Target;
 use super::journal;
-use crate::config::{Config, Output, provenance};
+use crate::config::{Config, Output, provenance, stage_constants, stage_parameters};
 use crate::grid::Region;
 use crate::kernel::reduce::planes;
 use crate::plan::{Group, OutputPlan, Plan};
@@ -44,6 +44,11 @@ pub fn is_complete(plan: &Plan, o: usize, hash: &str) -> bool {
 pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwrite: bool) -> Result<Start> {
     let hash = header["config_hash"].as_str().unwrap_or_default();
     if overwrite {
+        // All are looked at before the first is deleted.
+        for output in &plan.outputs {
+            let found = existing(&output.spec.path);
+            refuse_foreign(config, output, &found)?;
+        }
         for output in &plan.outputs {
             clear(config, output)?;
         }
@@ -99,13 +104,16 @@ fn refused(config: &Config, output: &OutputPlan, what: &str) -> Error {
 }
 
 fn clear(config: &Config, output: &OutputPlan) -> Result<()> {
-    match existing(&output.spec.path) {
-        Existing::None => Ok(()),
-        Existing::Ours { .. } => remove_ours(&output.spec.path),
-        Existing::Foreign => {
-            Err(refused(config, output, "was not written by this program, so --overwrite leaves it alone"))
-        }
+    let found = existing(&output.spec.path);
+    refuse_foreign(config, output, &found)?;
+    if matches!(found, Existing::None) { Ok(()) } else { remove_ours(&output.spec.path) }
+}
+
+fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Result<()> {
+    if !matches!(found, Existing::Foreign) {
+        return Ok(());
     }
+    Err(refused(config, output, "was not written by this program, so --overwrite leaves it alone"))
 }
 
 /// Opens every output of a group that is not complete.
@@ -205,7 +213,7 @@ pub fn attributes(
         "value_range": range.filter(|_| integer),
         "fill": json_number(output.spec.fill),
         "polarity": output.openness.then_some("openness: 1 is open, 0 is occluded"),
-        "channel": if output.openness { "openness" } else { "value" },
+        "channel": channel_names(config, output),
         "units": lattice.unit,
         "spacing": lattice.spacing,
         "region": [output.region.lo, output.region.hi],
@@ -214,11 +222,18 @@ pub fn attributes(
     })
 }
 
+/// The channel's own name (`openness`, `variance`, ...; `value` for an input), a list where there are several.
+fn channel_names(config: &Config, output: &OutputPlan) -> Value {
+    let from = &config_output(config, output).from;
+    let names: Vec<&str> = from.iter().map(|r| config.channel_of(r).unwrap_or("value")).collect();
+    if let [one] = names[..] { json!(one) } else { json!(names) }
+}
+
 fn json_number(v: f64) -> Value {
     if v.is_finite() { json!(v) } else { json!(v.to_string()) }
 }
 
-/// Stages that an output hangs on, as the config spells their parameters.
+/// Stages that an output hangs on, with their parameters by the names of the config.
 fn methods(config: &Config, from: &[crate::config::Ref]) -> Vec<Value> {
     let mut open: Vec<&crate::config::Ref> = from.iter().collect();
     let mut seen: Vec<&str> = Vec::new();
@@ -230,7 +245,11 @@ fn methods(config: &Config, from: &[crate::config::Ref]) -> Vec<Value> {
         }
         seen.push(&stage.name);
         open.extend(stage.reads().into_iter().map(|(_, r)| r));
-        list.push(json!({ "name": stage.name, "op": stage.op.word(), "parameters": format!("{:?}", stage.op) }));
+        let op = stage.op.word();
+        list.push(json!({
+            "name": stage.name, "op": op, "parameters": stage_parameters(&config.text, &stage.name, op),
+            "constants": stage_constants(&stage.op),
+        }));
     }
     list
 }

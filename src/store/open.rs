@@ -4,7 +4,12 @@ use super::Source;
 use crate::Result;
 use crate::config::Config;
 
-/// Opens the config's inputs in order: headers only. Errors name the line of the input.
+/// Opens the config's inputs in order, for a run within its budget: headers only. Errors name the line of the key.
 pub fn open_inputs(config: &Config) -> Result<Vec<Source>> {
-    config.inputs.iter().map(|i| Source::open(i).map_err(|e| e.located(&config.file, i.place.line))).collect()
+    let open = |i| {
+        let mut source = Source::open(i).map_err(|e| config.locate(e))?;
+        source.flatten(config.run.memory);
+        Ok(source)
+    };
+    config.inputs.iter().map(open).collect()
 }

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 
+import further
 import numpy as np
 
 PROGRAM = pathlib.Path(sys.argv[1]).resolve()
@@ -825,8 +826,12 @@ def commands(folder):
     CHECKS += 20
 
 
+def second_reading(folder):
+    further.run_all(folder, stage, close)
+
+
 def main():
-    parts = [methods, borders, gaussians, gradients, obscurances, formats, pyramids, maps, scaling, infinities, pointwise, wheres, ranges, commands]
+    parts = [methods, borders, gaussians, gradients, obscurances, formats, pyramids, maps, scaling, infinities, pointwise, wheres, ranges, commands, second_reading]
     chosen = sys.argv[2:]
     for part in parts:
         if chosen and part.__name__ not in chosen:

@@ -1,9 +1,9 @@
 //! Writes finished rows to the requested channels.
 
-use super::WindowOut;
 use super::estimate::{self, Acc, Code, Polarity, RowSum, Spread, Width};
 use super::int::Setup;
 use super::plan::{Plain, cut, padded};
+use super::{WindowOut, exact};
 use crate::grid::{Affine, AnyViewMut, Voxel};
 use crate::kernel::simd::Level;
 use crate::stage::{Method, Ties, WindowChannel, WindowParams};
@@ -66,7 +66,11 @@ impl<'a, 'b> Emit<'a, 'b> {
         if setup.job.needs.variance {
             estimate::numerator_row(level, row.s1, row.s2, row.n, row.width, &mut self.numerator[..len]);
             if self.wants(|c| matches!(c, WindowChannel::Variance | WindowChannel::Std | WindowChannel::Moment2)) {
-                estimate::variance_row(level, &self.numerator[..len], row.n, &mut self.variance[..len]);
+                if T::TOP == u32::MAX {
+                    exact::variance_row(level, row.s1, row.s2, row.n, &mut self.variance[..len]);
+                } else {
+                    estimate::variance_row(level, &self.numerator[..len], row.n, &mut self.variance[..len]);
+                }
             }
         }
         if self.wants(|c| matches!(c, WindowChannel::Mean | WindowChannel::Moment2)) {
@@ -98,6 +102,20 @@ impl<'a, 'b> Emit<'a, 'b> {
                     let lower = (channel == WindowChannel::Min) == (affine.slope > 0.0);
                     let codes = if lower { row.lo } else { row.hi };
                     put_codes(level, &mut self.outs[i].dst, at, &codes[..len], setup.flip, affine);
+                }
+                WindowChannel::Moment2 if T::TOP == u32::MAX && affine.is_identity() => {
+                    let (x, offset) = (at[2], setup.flip.u32());
+                    match &mut self.outs[i].dst {
+                        AnyViewMut::F64(d) => {
+                            let out = &mut d.row_at(at[0], at[1])[x..x + len];
+                            exact::moment2_row(level, row.s1, row.s2, row.n, offset, out);
+                        }
+                        AnyViewMut::F32(d) => {
+                            let out = &mut d.row_at(at[0], at[1])[x..x + len];
+                            exact::moment2_row(level, row.s1, row.s2, row.n, offset, out);
+                        }
+                        other => panic!("{channel:?} is not written as {}", other.dtype()),
+                    }
                 }
                 _ => put_moment(level, channel, &mut self.outs[i].dst, at, len, self.mean, self.variance, affine),
             }

@@ -13,6 +13,7 @@ mod along;
 mod beta;
 mod emit;
 mod estimate;
+mod exact;
 pub mod finish;
 mod float;
 mod float_estimate;

@@ -5,6 +5,7 @@
 
 mod bytes;
 mod detect;
+mod flat;
 mod identity;
 mod lattice;
 mod metaimage;
@@ -41,6 +42,8 @@ pub struct Source {
     info: VolumeInfo,
     kind: Kind,
     level: Level,
+    /// Of a Zarr array that is read from scratch: `None` until it is there.
+    flat: Option<Option<Planar>>,
 }
 
 #[derive(Debug)]
@@ -70,7 +73,7 @@ impl Source {
             InputKind::Path { path, raw } => open_path(input, path, raw.as_ref())?,
         };
         let info = overridden(info, input)?;
-        Ok(Source { info, kind, level: Level::detect() })
+        Ok(Source { info, kind, level: Level::detect(), flat: None })
     }
 
     /// A volume in memory. Panics if `voxels` does not have the shape's size or the shape is empty.
@@ -80,7 +83,7 @@ impl Source {
         let info = VolumeInfo::plain(shape, voxels.dtype(), "memory");
         let big = cfg!(target_endian = "big");
         let lattice = Lattice::dense(shape, voxels.dtype(), big, 0).expect("the voxels fit in memory");
-        Source { info, kind: Kind::Planar(Planar::memory(lattice, voxels)), level: Level::detect() }
+        Source { info, kind: Kind::Planar(Planar::memory(lattice, voxels)), level: Level::detect(), flat: None }
     }
 
     /// A volume in memory, copied from an array of axes z, y, x in any memory order. Panics if it is empty.
@@ -104,10 +107,20 @@ impl Source {
         &self.info
     }
 
+    /// Reads a Zarr array by planes from scratch, once prepared, where its chunks are so flat or large that a run of this
+    /// budget would decode them again and again. The volume then has no chunks.
+    pub fn flatten(&mut self, memory: u64) {
+        if matches!(self.kind, Kind::Zarr(_)) && flat::is_flat(&self.info, memory) {
+            self.info.chunk = None;
+            self.flat = Some(None);
+        }
+    }
+
     /// Bytes of scratch disk that [`Source::prepare`] needs (0 for sources that are read in place).
     pub fn spool_bytes(&self) -> u64 {
         match &self.kind {
             Kind::Planar(planar) => planar.spool_bytes(),
+            Kind::Zarr(_) if matches!(self.flat, Some(None)) => flat::bytes(&self.info),
             Kind::Zarr(_) | Kind::Synthetic(_) => 0,
         }
     }
@@ -118,6 +131,11 @@ impl Source {
     pub fn prepare(&mut self, scratch: &Path, progress: &dyn Fn(u64) -> bool) -> Result<()> {
         match &mut self.kind {
             Kind::Planar(planar) => planar.prepare(scratch, progress),
+            Kind::Zarr(array) if matches!(self.flat, Some(None)) => {
+                let (lattice, files) = flat::run(array, &self.info, scratch, progress)?;
+                self.flat = Some(Some(Planar::held(lattice, files)));
+                Ok(())
+            }
             Kind::Zarr(_) | Kind::Synthetic(_) => Ok(()),
         }
     }
@@ -139,7 +157,10 @@ impl Source {
         }
         let bytes = match &self.kind {
             Kind::Planar(planar) => planar.read(self.level, component, region, reborrow(&mut dst))?,
-            Kind::Zarr(array) => array.read(component, region, &self.info, reborrow(&mut dst))?,
+            Kind::Zarr(array) => match &self.flat {
+                Some(Some(planes)) => planes.read(self.level, component, region, reborrow(&mut dst))?,
+                _ => array.read(component, region, &self.info, reborrow(&mut dst))?,
+            },
             Kind::Synthetic(field) => {
                 field.read(region, reborrow(&mut dst));
                 0
@@ -158,24 +179,37 @@ impl Source {
             return Err(Error::Failed(format!("{} has no chunks", self.info.format)));
         };
         let mut read = array.read_chunk(component, chunk, dst)?;
-        if let Some(nodata) = self.info.nodata.filter(|_| self.info.dtype.is_float()) {
-            let same = |fill: f64| match self.info.dtype {
-                DType::F32 => fill as f32 == nodata as f32,
-                _ => fill == nodata,
-            };
-            match &mut read {
-                ChunkRead::Missing(fill) if same(*fill) => *fill = f64::NAN,
-                ChunkRead::Missing(_) => {}
-                ChunkRead::Data { .. } => lattice::mark_missing(&mut dst.view_mut(shape), nodata),
+        match &mut read {
+            ChunkRead::Missing(fill) => *fill = self.fill(*fill),
+            ChunkRead::Data { .. } => {
+                if let Some(nodata) = self.info.nodata.filter(|_| self.info.dtype.is_float()) {
+                    lattice::mark_missing(&mut dst.view_mut(shape), nodata);
+                }
             }
         }
         Ok(read)
     }
 
+    /// What a chunk holds that is not stored; `None` where it is, or where the source has no chunks. Looks at files and
+    /// indexes only.
+    pub fn absent_chunk(&self, component: usize, chunk: [i64; 3]) -> Result<Option<f64>> {
+        let Kind::Zarr(array) = &self.kind else { return Ok(None) };
+        Ok(array.absent_chunk(component, chunk)?.map(|fill| self.fill(fill)))
+    }
+
+    /// The fill value of a Zarr array as voxels have it: NaN where it is a float's nodata.
+    fn fill(&self, fill: f64) -> f64 {
+        let missing = self.info.nodata.filter(|_| self.info.dtype.is_float()).is_some_and(|nodata| {
+            if self.info.dtype == DType::F32 { fill as f32 == nodata as f32 } else { fill == nodata }
+        });
+        if missing { f64::NAN } else { fill }
+    }
+
     /// The pages of this box will not be wanted again soon. Acts on boxes of whole z planes of mapped files.
     pub fn release(&self, region: Region) {
-        if let Kind::Planar(planar) = &self.kind {
-            planar.release(region);
+        match (&self.kind, &self.flat) {
+            (Kind::Planar(planar), _) | (_, Some(Some(planar))) => planar.release(region),
+            _ => {}
         }
     }
 

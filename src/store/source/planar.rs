@@ -67,6 +67,11 @@ impl Planar {
         Planar { lattice, files, pending: Pending::Nothing, paths: Vec::new(), header: Vec::new() }
     }
 
+    /// A volume in files that are open already.
+    pub fn held(lattice: Lattice, files: Files) -> Planar {
+        Planar { lattice, files: Some(files), pending: Pending::Nothing, paths: Vec::new(), header: Vec::new() }
+    }
+
     pub fn spool_bytes(&self) -> u64 {
         match &self.pending {
             Pending::Nothing => 0,

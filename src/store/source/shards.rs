@@ -41,6 +41,11 @@ impl Shard {
         Ok(Shard { path, file, len, index })
     }
 
+    /// Whether the index has an inner chunk.
+    pub fn holds(&self, entry: usize) -> bool {
+        self.index[entry] != [u64::MAX; 2]
+    }
+
     pub fn path(&self) -> &Path {
         &self.path
     }

@@ -6,6 +6,7 @@ use std::num::NonZeroU64;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use zarrs::array::codec::CodecChain;
 use zarrs::array::{Array, ArrayBytes, ArrayMetadata, ArrayToBytesCodecTraits, CodecOptions};
@@ -15,7 +16,7 @@ use super::ChunkRead;
 use super::planar::key;
 use super::planar::{components, shape_of};
 use super::shards::{Shard, Shards};
-use super::zarr_meta::{self, ArrayMeta, Multiscale};
+use super::zarr_meta::{self, ArrayMeta, Multiscale, ShardMeta};
 use crate::brick::Voxels;
 use crate::config::Input;
 use crate::grid::{Region, Voxel};
@@ -38,6 +39,8 @@ pub struct ZarrArray {
     /// Chunks of the volume along z, y, x.
     grid: [i64; 3],
     options: CodecOptions,
+    /// Folders that changed later may have lost chunks.
+    opened: SystemTime,
 }
 
 impl std::fmt::Debug for ZarrArray {
@@ -219,7 +222,8 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     }
 
     let failed = |e: String| Error::file(&folder, format!("the Zarr array cannot be read: {e}"));
-    let store = FilesystemStore::new(&folder).map_err(|e| failed(e.to_string()))?;
+    // Files are opened here, under paths of any bytes; the library, which wants UTF-8, only decodes.
+    let store = FilesystemStore::new("/").map_err(|e| failed(e.to_string()))?;
     let array = guarded(|| {
         let metadata: ArrayMetadata = serde_json::from_value(meta.value.clone()).map_err(|e| e.to_string())?;
         Array::new_with_metadata(Arc::new(store), "/", metadata).map_err(|e| e.to_string())
@@ -244,7 +248,10 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     let grid = std::array::from_fn(|a| shape[a].div_ceil(chunk[a]) as i64);
     let options = CodecOptions::default().with_concurrent_target(1);
     let shards = Shards::default();
-    Ok((info, ZarrArray { folder, meta, array, codecs, inner, fill, shards, lead, components, grid, options }))
+    // A server's clock may run ahead of this machine's.
+    let touched = folder.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
+    let opened = touched.max(SystemTime::now());
+    Ok((info, ZarrArray { folder, meta, array, codecs, inner, fill, shards, lead, components, grid, options, opened }))
 }
 
 /// Runs a call into the Zarr library; a panic there (broken metadata or data) becomes an error.
@@ -267,6 +274,14 @@ impl ZarrArray {
     /// Outer chunks (files) per axis.
     pub fn outer_grid(&self) -> Vec<u64> {
         self.meta.shape.iter().zip(&self.meta.outer).map(|(n, c)| n.div_ceil(*c)).collect()
+    }
+
+    /// Voxels of a chunk, z, y, x.
+    pub fn chunk(&self) -> [usize; 3] {
+        let tail = &self.meta.inner[self.lead..];
+        let mut zyx = [1; 3];
+        zyx[3 - tail.len()..].iter_mut().zip(tail).for_each(|(e, n)| *e = *n as usize);
+        zyx
     }
 
     /// Index of the inner chunk in the whole array.
@@ -332,7 +347,7 @@ impl ZarrArray {
         let Some(shard_meta) = &self.meta.shard else {
             let path = self.file_of(index);
             let most = self.most_encoded();
-            let Some((file, len)) = open_if_there(&path)? else { return Ok(None) };
+            let Some((file, len)) = open_if_there(&path)? else { return self.still_there(&path).map(|()| None) };
             if len > most {
                 return Err(Error::file(&path, format!("a chunk of {len} bytes; decoded it has only {}", most / 2)));
             }
@@ -340,18 +355,48 @@ impl ZarrArray {
             file.read_exact_at(&mut bytes, 0).map_err(|e| Error::file(&path, e))?;
             return Ok(Some((path, bytes)));
         };
-        let outer: Vec<u64> = index.iter().zip(&shard_meta.grid).map(|(i, g)| i / g).collect();
+        let Some((shard, entry)) = self.shard_of(index, shard_meta)? else { return Ok(None) };
+        let bytes = shard.read(entry, index, self.most_encoded())?;
+        Ok(bytes.map(|b| (shard.path().to_path_buf(), b)))
+    }
+
+    /// A file that is not there is a chunk that was never stored, unless its folder is gone or has changed since the array
+    /// was opened: then it may have vanished, and the fill value would be a guess.
+    fn still_there(&self, path: &Path) -> Result<()> {
+        let inside = path.ancestors().skip(1).take_while(|d| d.starts_with(&self.folder));
+        let folder = inside.filter_map(|d| d.metadata().ok()).next();
+        let text = match folder.map(|m| m.modified()) {
+            None => "the chunk is gone: the array's folder vanished while it was read",
+            Some(Ok(changed)) if changed > self.opened => {
+                "the chunk is not there, and its folder changed while the array was read: it may have been deleted"
+            }
+            Some(_) => return Ok(()),
+        };
+        Err(Error::file(path, text))
+    }
+
+    /// The shard of an inner chunk, where there is one, and the chunk's place in its index.
+    fn shard_of(&self, index: &[u64], meta: &ShardMeta) -> Result<Option<(Arc<Shard>, usize)>> {
+        let outer: Vec<u64> = index.iter().zip(&meta.grid).map(|(i, g)| i / g).collect();
         let shard = self.shards.get(&outer, || {
             let path = self.file_of(&outer);
             match open_if_there(&path)? {
-                None => Ok(None),
-                Some((file, len)) => Shard::open(path, file, len, shard_meta).map(Some),
+                None => self.still_there(&path).map(|()| None),
+                Some((file, len)) => Shard::open(path, file, len, meta).map(Some),
             }
         })?;
-        let Some(shard) = shard else { return Ok(None) };
-        let entry = index.iter().zip(&shard_meta.grid).fold(0, |at, (i, g)| at * g + i % g);
-        let bytes = shard.read(entry as usize, index, self.most_encoded())?;
-        Ok(bytes.map(|b| (shard.path().to_path_buf(), b)))
+        let entry = index.iter().zip(&meta.grid).fold(0, |at, (i, g)| at * g + i % g);
+        Ok(shard.map(|s| (s, entry as usize)))
+    }
+
+    /// What a chunk holds where nothing is stored for it; by its file or its shard's index, without reading a voxel.
+    pub fn absent_chunk(&self, component: usize, chunk: [i64; 3]) -> Result<Option<f64>> {
+        let index = self.index(component, chunk)?;
+        let stored = match &self.meta.shard {
+            None => self.file_of(&index).exists(),
+            Some(meta) => self.shard_of(&index, meta)?.is_some_and(|(shard, entry)| shard.holds(entry)),
+        };
+        Ok((!stored).then_some(self.fill))
     }
 
     /// Longest stored form of an inner chunk that is believed.
@@ -367,7 +412,7 @@ impl ZarrArray {
         info: &VolumeInfo,
         mut dst: crate::grid::AnyViewMut,
     ) -> Result<u64> {
-        let chunk_shape = info.chunk.unwrap_or([1; 3]);
+        let chunk_shape = self.chunk();
         let mut chunk = Voxels::zeroed(info.dtype, chunk_shape.iter().product());
         let mut read = 0;
         for index in region.cells([0; 3], chunk_shape).iter() {

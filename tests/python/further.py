@@ -1,0 +1,168 @@
+"""Checks for interop.py that were found by a second reading of the formulas: each of them once failed, or guards a corner
+that no other check looks into. `stage(folder, source, body, channel)` runs one stage; `close` compares."""
+
+import itertools
+import json
+import math
+from fractions import Fraction
+
+import numpy as np
+from scipy.spatial import ConvexHull, SphericalVoronoi
+
+RNG = np.random.default_rng(20261126)
+
+
+def icosahedron(n):
+    g = (1 + math.sqrt(5)) / 2
+    points = np.array([np.roll((0, a, b * g), k) for a in (1, -1) for b in (1, -1) for k in range(3)])
+    points /= np.linalg.norm(points[0])
+    while len(points) < n:
+        edges = {tuple(sorted(e)) for t in ConvexHull(points).simplices for e in itertools.combinations(t, 2)}
+        middles = np.array([points[a] + points[b] for a, b in sorted(edges)])
+        points = np.vstack([points, middles / np.linalg.norm(middles, axis=1)[:, None]])
+    return points
+
+
+def regression(v, spacing, size, inverse):
+    """The gradient by weighted linear regression, with the full normal equations where a voxel is missing."""
+    h = size // 2
+    pad = np.pad(v, h, mode="edge")
+    offsets = np.array(list(itertools.product(range(-h, h + 1), repeat=3)))
+    x = offsets * np.array(spacing, float)
+    distance = np.linalg.norm(x, axis=1)
+    weight = np.divide(1, distance, out=np.zeros_like(distance), where=distance > 0) if inverse else distance
+    out = np.full(v.shape + (3,), np.nan)
+    for p in np.ndindex(v.shape):
+        if np.isnan(v[p]):
+            continue
+        f = pad[tuple(slice(i, i + size) for i in p)].ravel()
+        have = ~np.isnan(f)
+        if have.all():
+            out[p] = ((weight * f) @ x) / (weight @ x**2)
+            continue
+        a = np.c_[x, np.ones(len(x))][have] * np.sqrt(weight[have])[:, None]
+        out[p] = np.linalg.lstsq(a, f[have] * np.sqrt(weight[have]), rcond=None)[0][:3]
+    return out
+
+
+def first_occluder(v, w, spacing, reach):
+    """Planes to the first larger voxel along the lattice lines of direction w (x, y, z); 0 where there is none."""
+    u = w[::-1] / spacing
+    a = max(range(3), key=lambda i: (round(abs(u[i]), 12), -i))
+    sign, m = (1 if u[a] > 0 else -1), u / abs(u[a])
+    step = float(np.linalg.norm(spacing * m))
+    at = lambda k, b: math.floor(k * m[b] + 0.5)
+    planes = np.zeros(v.shape, int)
+    for p in np.ndindex(v.shape):
+        k = sign * p[a]
+        for j in range(1, math.floor(reach / step + 1e-9) + 1):
+            q = tuple(p[b] + (sign * j if b == a else at(k + j, b) - at(k, b)) for b in range(3))
+            if not all(0 <= q[b] < v.shape[b] for b in range(3)):
+                break
+            if v[q] > v[p]:
+                planes[p] = j
+                break
+    return planes, step
+
+
+def weights(folder, stage, close):
+    """Obscurance weighed by the normal, by Voronoi cells, and by both: one component, whatever weighs it."""
+    for name, dtype, spacing in [("u8", "u1", (1.0, 1.0, 1.0)), ("f32", "<f4", (2.5, 1.0, 0.7))]:
+        v = RNG.integers(0, 60, (6, 7, 5)).astype(dtype)
+        if dtype == "<f4":
+            v[RNG.random(v.shape) < 0.08] = np.nan
+        np.save(folder / "a.npy", v)
+        d, spacing = v.astype(float), np.array(spacing)
+        points = icosahedron(42)
+        normal = -regression(d, spacing, 3, True)
+        length = np.linalg.norm(normal, axis=-1)
+        area = SphericalVoronoi(points, 1, np.zeros(3)).calculate_areas()
+        reach = 4.0 * spacing.min()
+        value = []
+        for w in points:
+            planes, step = first_occluder(d, w, spacing, reach)
+            value.append(np.where(planes > 0, np.sqrt(planes * step / reach), 1.0))
+        for facing in (False, True):
+            for cells in (False, True):
+                total, norm = np.zeros(v.shape), np.zeros(v.shape)
+                for w, o, cell in zip(points, value, area if cells else np.ones(len(points))):
+                    share = np.full(v.shape, cell)
+                    if facing:
+                        cosine = np.divide(normal @ w[::-1], length, out=np.zeros(v.shape), where=length > 0)
+                        share = np.where(length > 0, cell * np.maximum(cosine, 0), cell)
+                    total += share * o
+                    norm += share
+                want = np.where(np.isnan(d), np.nan, total / norm)
+                keys = f"weight_by_normal = {json.dumps(facing)}\nweights = '{'voronoi' if cells else 'uniform'}'"
+                body = f"op = 'obscurance'\nmax_distance = 4\n{keys}"
+                got = stage(folder, f"path = 'a.npy'\nspacing = {spacing.tolist()}", body)
+                close(f"obscurance {name} normal {facing} voronoi {cells}", got, want, 1e-6)
+
+
+def holes(folder, stage, close):
+    """Gradients beside missing voxels: the full regression over the others."""
+    v = RNG.normal(size=(6, 7, 8)).astype("<f4")
+    v[RNG.random(v.shape) < 0.1] = np.nan
+    np.save(folder / "a.npy", v)
+    for size, weight in itertools.product((3, 5), ("distance", "inverse")):
+        want = np.moveaxis(regression(v.astype(float), (2.0, 1.0, 0.5), size, weight == "inverse"), -1, 0)
+        body = f"op = 'gradient'\nsize = {size}\nweight = '{weight}'"
+        got = stage(folder, "path = 'a.npy'\nspacing = [2.0, 1.0, 0.5]", body, "s.vector")
+        close(f"gradient with holes {size} {weight}", got, want, 2e-5)
+
+
+def rounded(folder, stage, close):
+    """Moments of integers against fractions: rounded once, to the very bit."""
+    r = 1
+    for name in ("u1", "i1", "<u2", "<i2", "<u4", "<i4"):
+        info = np.iinfo(name)
+        v = RNG.integers(info.min, info.max, (5, 6, 7), dtype=np.dtype(name).newbyteorder("="), endpoint=True)
+        np.save(folder / "a.npy", v.astype(name))
+        to = np.float64 if v.dtype.itemsize == 4 else np.float32
+        want = {c: np.empty(v.shape) for c in ("mean", "variance", "moment2")}
+        for p in np.ndindex(v.shape):
+            w = [int(x) for x in v[tuple(slice(max(0, i - r), i + r + 1) for i in p)].ravel()]
+            mean, square = Fraction(sum(w), len(w)), Fraction(sum(x * x for x in w), len(w))
+            want["mean"][p], want["variance"][p], want["moment2"][p] = to(mean), to(square - mean * mean), to(square)
+        for channel, expected in want.items():
+            got = stage(folder, "path = 'a.npy'", f"op = 'box'\nradius = {r}", f"s.{channel}")
+            close(f"{name} {channel} rounded once", got, expected, 0)
+
+
+def scaled(folder, stage, close):
+    """Negative slope, intercept and nodata through windows, ranks, gradients and masks at once."""
+    v = RNG.integers(-50, 50, (6, 7, 8)).astype("<i2")
+    np.save(folder / "a.npy", v)
+    s = np.where(v == -7, np.nan, -1.5 * v + 10)
+    source = "path = 'a.npy'\nslope = -1.5\nintercept = 10\nnodata = -7"
+    pad = np.pad(s, 1, constant_values=7.0)
+    mean = np.array([np.nanmean(pad[tuple(slice(i, i + 3) for i in p)]) for p in np.ndindex(s.shape)]).reshape(s.shape)
+    needed = (s >= -10) & (s <= 40)
+    body = "op = 'box'\nradius = 1\nborder = { constant = 7.0 }\nwhere = { input = 'a', min = -10, max = 40 }\nfill = -77"
+    close("scaled mean under a mask", stage(folder, source, body), np.where(needed, mean, -77), 1e-5)
+    clip = np.pad(s, 2, constant_values=np.nan)
+    rank = np.full(s.shape, np.nan)
+    for p in np.ndindex(s.shape):
+        w = clip[tuple(slice(i, i + 5) for i in p)]
+        if not np.isnan(s[p]):
+            rank[p] = ((w >= s[p]).sum() + (w > s[p]).sum()) / (2 * (~np.isnan(w)).sum())
+    body = "op = 'ambient_occlusion'\nmethod = 'exact'\nradius = 2\nsolid = 'low'\nties = 'mid'"
+    close("scaled rank of the low side", stage(folder, source, body), rank, 1e-6)
+    want = np.linalg.norm(regression(s, (1, 1, 1), 5, False), axis=-1)
+    close("scaled gradient with nodata", stage(folder, source, "op = 'gradient'"), want, 1e-4)
+    for slope in ("0", "nan"):
+        got = stage(folder, f"path = 'a.npy'\nslope = {slope}\nintercept = 5", "op = 'box'\nradius = 0")
+        close(f"slope {slope} means 1 and 0", got, v, 0)
+
+
+def halves(folder, stage, close):
+    """Codes of values half way between two."""
+    v = np.arange(51, dtype="u1").reshape(1, 3, 17)
+    np.save(folder / "a.npy", v)
+    got = stage(folder, "path = 'a.npy'", "op = 'box'\nradius = 0", dtype="u8", range=[0, 50])
+    close("half codes", got, np.rint(v / 50 * 255), 0)
+
+
+def run_all(folder, stage, close):
+    for part in (weights, holes, rounded, scaled, halves):
+        part(folder, stage, close)
