@@ -124,8 +124,9 @@ impl Prepared {
         let tile: Shape = std::array::from_fn(|a| TILE[a].min(dst[a]));
         let planes = |f: &lines::Family| (tile[f.axis] + 2 * driver::reach_in(f, src[f.axis])).min(src[f.axis]);
         let turned = self.families.iter().any(|f| f.axis == 2);
+        let copies = [keys::padded_len(src), if turned { keys::padded_len(FRAMES[1].map(|a| src[a])) } else { 0 }];
         Sizes {
-            keys: [keys::padded_len(src), if turned { keys::padded_len(FRAMES[1].map(|a| src[a])) } else { 0 }],
+            keys: if tile == dst { [copies[0].max(copies[1]), 0] } else { copies },
             sums: FRAMES.map(|frame| sinks::sums_len(tile, frame)),
             tile: tile.iter().product(),
             sheet: self.families.iter().map(planes).max().unwrap_or(0),
@@ -155,21 +156,31 @@ impl Prepared {
         let (forward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
         let (backward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
 
-        let (least, most) = keys::encode(src, self.params.missing, self.params.flipped, natural);
-        let flat = least >= most; // nothing is greater than anything
-        if !flat && !swapped.is_empty() {
-            keys::swap(natural, src_box.shape(), swapped);
-        }
+        let missing = keys::missing_of::<T>(self.params.missing);
+        let code = keys::Code { missing, flipped: self.params.flipped };
+        let level = cx.level;
+        let most = keys::encode(level, src, code, natural);
+        let at = src_box.offset_of(&dst_box);
+        // Nothing is greater than any voxel that is asked for.
+        let flat = keys::least(level, src.part(at, dst_box.shape()), code) >= most;
+        let encode = |frame: usize, out: &mut [T::Key]| match frame {
+            0 => _ = keys::encode(level, src, code, out),
+            _ => keys::encode_turned(level, src, code, out),
+        };
         let mut pass = Pass {
             prepared: self,
             level: cx.level,
             flat,
-            volumes: [natural, swapped],
+            keys: Keys {
+                shared: swapped.is_empty(),
+                copies: [natural, swapped],
+                hold: [Some(0), None],
+                encode: &encode,
+            },
             src_box,
             dst_box,
             buffers: Buffers { sheet, hits, stack, starts, turned, shifts, tables: [forward, backward] },
         };
-        let missing = keys::missing_of::<T>(self.params.missing);
         // NaN where a voxel of the row that starts at `p` is missing.
         let gone = |p: [i64; 3], row: &mut [f32]| {
             let [z, y, x] = [0, 1, 2].map(|a| (p[a] - src_box.lo[a]) as usize);
@@ -187,10 +198,30 @@ struct Pass<'a, K> {
     level: Level,
     /// Nothing is greater than anything.
     flat: bool,
-    volumes: [&'a [K]; 2],
+    keys: Keys<'a, K>,
     src_box: Region,
     dst_box: Region,
     buffers: Buffers<'a, K>,
+}
+
+/// Padded copies of the source in the order of each frame. A sweep of one tile needs one after the other, in one place.
+struct Keys<'a, K> {
+    copies: [&'a mut [K]; 2],
+    shared: bool,
+    /// The frame that each copy is in.
+    hold: [Option<usize>; 2],
+    encode: &'a dyn Fn(usize, &mut [K]),
+}
+
+impl<K> Keys<'_, K> {
+    fn in_frame(&mut self, frame: usize) -> &[K] {
+        let place = if self.shared { 0 } else { frame };
+        if self.hold[place] != Some(frame) {
+            (self.encode)(frame, self.copies[place]);
+            self.hold[place] = Some(frame);
+        }
+        self.copies[place]
+    }
 }
 
 impl<K: Key> Pass<'_, K> {
@@ -270,8 +301,7 @@ impl<K: Key> Pass<'_, K> {
     fn sweep_tile<S: Sink>(&mut self, tile: Region, sink: &mut S) {
         for group in driver::groups(&self.prepared.families) {
             let frame = driver::frame_of(&group[0]);
-            let volume = Volume::new(self.volumes[frame], in_frame(self.src_box, FRAMES[frame]));
-            // What is flat has no turned copy.
+            let volume = Volume::new(self.keys.in_frame(frame), in_frame(self.src_box, FRAMES[frame]));
             let most = if self.flat { 0 } else { usize::MAX };
             driver::sweep_group(self.level, group, most, volume, tile, &mut self.buffers, sink);
         }
@@ -287,7 +317,7 @@ fn f32_view(view: AnyViewMut) -> ViewMut<f32> {
 
 /// Elements of the parts of the scratch.
 struct Sizes {
-    /// Padded copies: natural, and with x and z exchanged.
+    /// Padded copies: natural, and with x and z exchanged, or one in the place of both.
     keys: [usize; 2],
     /// Sums of both frames of a tile, and its voxels.
     sums: [usize; 2],
