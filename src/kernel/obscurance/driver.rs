@@ -4,11 +4,13 @@
 //! one copy of a sheet into the first-level cache serves both senses, and a step along 64 lines is one row. Directions
 //! dominated by x run on a copy with x and z exchanged.
 
+use std::ops::Range;
+
 use super::contribute;
 use super::keys::{Key, LANES, Volume};
 use super::lines::{Family, displacement};
 use super::scan::{self, Hit, Sheet, Spans};
-use super::sinks::{Piece, Sink, Visit};
+use super::sinks::{Sink, Strip, Visit};
 use crate::grid::Region;
 use crate::kernel::simd::Level;
 
@@ -32,10 +34,41 @@ pub(super) struct Buffers<'a, K> {
     pub starts: &'a mut [usize],
     /// For the AVX-512 search.
     pub turned: &'a mut [u8],
-    /// One entry per plane of the source.
-    pub shifts: [&'a mut [i32]; 2],
-    /// One entry per answer.
-    pub tables: [&'a mut [u32]; 2],
+    /// One entry per plane of the source: along the shared axis, and along the last one for each family.
+    pub shifts: [&'a mut [i32]; 1 + TOGETHER],
+    /// One entry per answer, of each family for each sense.
+    pub tables: [[&'a mut [u32]; TOGETHER]; 2],
+}
+
+/// Families that are swept together at most: those that move alike along the one axis across sheets cross the same
+/// rows, which stay in the second-level cache between them. The sets of 12, 42 and 162 directions have up to three such
+/// families. 2-core Zen 4 VM, AVX-512, 2026-11-26: see benches/results/obscurance.md.
+pub(super) const TOGETHER: usize = 4;
+
+/// Frame axis along which lines of a family run, and the one across which its sheets follow each other.
+fn axes(family: &Family) -> (usize, usize) {
+    let along = usize::from(family.axis == 1);
+    (along, 1 - along)
+}
+
+/// Frame of the keys that a family reads; see [`FRAMES`].
+pub(super) fn frame_of(family: &Family) -> usize {
+    usize::from(family.axis == 2)
+}
+
+/// Families sorted so that those that can be swept together stand together.
+pub(super) fn sort(families: &mut [Family]) {
+    let key = |f: &Family| (f.axis, f.slope[FRAMES[frame_of(f)][axes(f).1]]);
+    families.sort_by(|a, b| key(a).0.cmp(&key(b).0).then(key(a).1.total_cmp(&key(b).1)));
+}
+
+/// Runs of sorted families that are swept together.
+pub(super) fn groups(families: &[Family]) -> impl Iterator<Item = &[Family]> {
+    let alike = |f: &Family, g: &Family| {
+        let b = FRAMES[frame_of(f)][axes(f).1];
+        f.axis == g.axis && f.slope[b] == g.slope[b]
+    };
+    families.chunk_by(alike).flat_map(|run| run.chunks(TOGETHER))
 }
 
 /// Planes that a family looks ahead in a source of `extent` planes.
@@ -43,48 +76,58 @@ pub(super) fn reach_in(family: &Family, extent: usize) -> usize {
     family.reach.min(extent.saturating_sub(1))
 }
 
-/// Sweeps both senses of one family over `tile` (natural order), reading the keys of the family's frame and looking
-/// `reach` planes ahead (at most [`reach_in`]).
-pub(super) fn sweep_family<K: Key, S: Sink>(
+/// Sweeps both senses of a group of families (see [`groups`]) over `tile` (natural order), reading the keys of their
+/// frame and looking `most` planes ahead at most. Answers are "open" wherever nothing is in reach.
+pub(super) fn sweep_group<K: Key, S: Sink>(
     level: Level,
-    family: &Family,
-    reach: usize,
+    group: &[Family],
+    most: usize,
     volume: Volume<K>,
     tile: Region,
     buffers: &mut Buffers<K>,
     sink: &mut S,
 ) {
-    let perm = FRAMES[usize::from(family.axis == 2)];
-    let axis = usize::from(family.axis == 1);
-    let planes = volume.region.shape()[axis];
-    let origin = volume.region.lo[axis];
+    let perm = FRAMES[frame_of(&group[0])];
+    let (a, b) = axes(&group[0]);
+    let planes = volume.region.shape()[a];
+    let origin = volume.region.lo[a];
     let Buffers { sheet, hits, stack, starts, turned, shifts, tables } = buffers;
-    for (shift, slope) in shifts.iter_mut().zip([family.slope[perm[1 - axis]], family.slope[perm[2]]]) {
-        for (i, s) in shift[..planes].iter_mut().enumerate() {
-            *s = displacement(slope, origin + i as i64) as i32;
-        }
-    }
-    for (table, sense) in tables.iter_mut().zip(&family.senses) {
-        if let Some(sense) = sense {
-            table[..reach].copy_from_slice(&sense.table[..reach]);
-            table[reach] = sense.table[family.reach];
-        }
-    }
-    let mut bytes = [[[0; 256]; 3]; 2];
-    contribute::split([&tables[0][..=reach], &tables[1][..=reach]], &mut bytes);
-    let visit = Visit {
-        bytes: &bytes,
-        family,
-        perm,
-        reach,
-        tables: [&tables[0][..=reach], &tables[1][..=reach]],
-        shifts: [&shifts[0][..planes], &shifts[1][..planes]],
-        origin,
+    let [shift_b, shift_c @ ..] = shifts;
+    let fill = |shift: &mut [i32], slope: f64| {
+        shift[..planes].iter_mut().zip(origin..).for_each(|(s, i)| *s = displacement(slope, i) as i32);
     };
+    fill(shift_b, group[0].slope[perm[b]]);
+    let mut bytes = [[[[0; 256]; 3]; 2]; TOGETHER];
+    for (i, family) in group.iter().enumerate() {
+        fill(shift_c[i], family.slope[perm[2]]);
+        let reach = reach_in(family, planes).min(most);
+        for (tables, sense) in tables.iter_mut().zip(&family.senses) {
+            let table = &mut tables[i];
+            if let Some(sense) = sense {
+                table[..reach].copy_from_slice(&sense.table[..reach]);
+                table[reach] = sense.table[family.reach];
+            }
+        }
+        contribute::split(tables.each_ref().map(|t| &t[i][..=reach]), &mut bytes[i]);
+    }
+    let visits: [Visit; TOGETHER] = std::array::from_fn(|i| {
+        let family = group.get(i).unwrap_or(&group[0]);
+        let reach = reach_in(family, planes).min(most);
+        Visit {
+            family,
+            perm,
+            reach,
+            tables: tables.each_ref().map(|t| &t[i][..=reach]),
+            bytes: &bytes[i],
+            shifts: [&shift_b[..planes], &shift_c[i][..planes]],
+            origin,
+        }
+    });
     let mut room = Room { rows: sheet, stack, starts, turned };
-    let job = Job { volume, tile: in_frame(tile, perm), axis, visit };
+    let visits = &visits[..group.len()];
+    let job = Job { volume, tile: in_frame(tile, perm), axis: a, visits };
     let [forward, backward] = hits;
-    if reach <= u8::MAX as usize {
+    if visits.iter().all(|visit| visit.reach <= u8::MAX as usize) {
         run::<K, u8, S>(level, &job, [bytes_of(forward), bytes_of(backward)], &mut room, sink);
     } else {
         run::<K, u32, S>(level, &job, [forward, backward], &mut room, sink);
@@ -102,7 +145,8 @@ struct Job<'a, K> {
     tile: Region,
     /// Frame axis along which the lines run.
     axis: usize,
-    visit: Visit<'a>,
+    /// They share the axis and the displacement along the other axis across it.
+    visits: &'a [Visit<'a>],
 }
 
 /// Parts of [`Buffers`] that the search needs.
@@ -115,7 +159,7 @@ struct Room<'a, K> {
 
 /// Planes `i` (counted from the source's first) in `of` at which `lo <= start + shift[i] < hi`; `shift` is monotone.
 #[inline(always)]
-fn planes_inside(shift: &[i32], of: std::ops::Range<usize>, start: i64, lo: i64, hi: i64) -> std::ops::Range<usize> {
+fn planes_inside(shift: &[i32], of: Range<usize>, start: i64, lo: i64, hi: i64) -> Range<usize> {
     let part = &shift[of.clone()];
     let at = |s: i32| start + s as i64;
     let rising = part.first() <= part.last();
@@ -132,74 +176,111 @@ fn span(shift: &[i32]) -> (i64, i64) {
 }
 
 fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2], room: &mut Room<K>, sink: &mut S) {
-    let Job { volume, tile, axis, visit } = job;
+    let Job { volume, tile, axis, visits } = job;
     let (a, b) = (*axis, 1 - *axis);
     let origin = volume.region.lo[a];
     let whole = (tile.lo[a] - origin) as usize..(tile.hi[a] - origin) as usize;
-    let [shift_b, shift_c] = visit.shifts;
-    let (least, most) = span(&shift_b[whole.clone()]);
+    let shift_b = visits[0].shifts[0];
     let [forward, backward] = hits;
+    let (least, most) = span(&shift_b[whole.clone()]);
     for s_b in tile.lo[b] - most..tile.hi[b] - least {
         let inside = planes_inside(shift_b, whole.clone(), s_b, tile.lo[b], tile.hi[b]);
         if inside.is_empty() {
             continue;
         }
-        let (least, most) = span(&shift_c[inside.clone()]);
-        for s_c in (tile.lo[2] - most..tile.hi[2] - least).step_by(LANES) {
-            let last = LANES as i64 - 1;
-            let queries = planes_inside(shift_c, inside.clone(), s_c, tile.lo[2] - last, tile.hi[2]);
-            if queries.is_empty() {
-                continue;
-            }
-            let first = queries.start.saturating_sub(visit.reach);
-            let end = (queries.end + visit.reach).min(shift_b.len());
-            let starts = &mut room.starts[..end - first];
-            place(volume, a, shift_b, shift_c, [s_b, s_c], first, starts);
-            let sheet = Sheet { data: volume.data(), planes: starts };
-            let count = queries.len() * LANES;
-            let local = queries.start - first..queries.end - first;
-            let mut answers: [&mut [H]; 2] = [&mut [], &mut []];
-            for (way, hits) in [&mut *forward, &mut *backward].into_iter().enumerate() {
-                if visit.family.senses[way].is_some() {
-                    answers[way] = &mut hits[..count];
-                }
-            }
-            let piece_of = |plane: usize| {
-                let start = s_c + shift_c[plane] as i64;
-                let mut at = [0, 0, start.max(tile.lo[2])];
-                at[a] = origin + plane as i64;
-                at[b] = s_b + shift_b[plane] as i64;
-                (Piece { at, axis: a }, start)
-            };
-            queries.clone().for_each(|plane| sink.expect(visit, &piece_of(plane).0));
-            let spans = spans(&shift_c[queries.clone()], s_c, tile);
-            let asked = answers.each_mut().map(|a| &mut **a);
-            scan::both(level, sheet, &spans, local, visit.reach, asked, room.rows, room.stack, room.turned);
-            for (row, plane) in queries.enumerate() {
-                let (piece, start) = piece_of(plane);
-                let (lo, hi) = (piece.at[2], (start + LANES as i64).min(tile.hi[2]));
-                if lo >= hi {
+        for (i, visit) in visits.iter().enumerate() {
+            let shift_c = visit.shifts[1];
+            let (least, most) = span(&shift_c[inside.clone()]);
+            for s_c in (tile.lo[2] - most..tile.hi[2] - least).step_by(LANES) {
+                let last = LANES as i64 - 1;
+                let planes = planes_inside(shift_c, inside.clone(), s_c, tile.lo[2] - last, tile.hi[2]);
+                if planes.is_empty() {
                     continue;
                 }
-                let lanes = row * LANES + (lo - start) as usize..row * LANES + (hi - start) as usize;
-                let of = |answers: &'_ [H]| if answers.is_empty() { 0..0 } else { lanes.clone() };
-                let (f, b) = (&answers[0][of(answers[0])], &answers[1][of(answers[1])]);
-                sink.add(visit, &piece, f, b);
+                let strip = Strip { axis: a, planes, start: [s_b, s_c], tile };
+                if i == 0 {
+                    sink.expect(visit, &strip);
+                }
+                sheet(level, volume, visit, &strip, [&mut *forward, &mut *backward], room, sink);
             }
         }
     }
 }
 
+/// Searches the lines of one strip and hands the answers on.
+fn sheet<K: Key, H: Hit, S: Sink>(
+    level: Level,
+    volume: &Volume<K>,
+    visit: &Visit,
+    strip: &Strip,
+    hits: [&mut [H]; 2],
+    room: &mut Room<K>,
+    sink: &mut S,
+) {
+    let [shift_b, shift_c] = visit.shifts;
+    let Range { start, end } = strip.planes;
+    let first = start.saturating_sub(visit.reach);
+    let starts = &mut room.starts[..(end + visit.reach).min(shift_b.len()) - first];
+    place(volume, strip.axis, shift_b, shift_c, strip.start, first, starts);
+    let sheet = Sheet { data: volume.data(), planes: starts };
+    let count = strip.planes.len() * LANES;
+    let mut answers: [&mut [H]; 2] = [&mut [], &mut []];
+    for (way, hits) in hits.into_iter().enumerate() {
+        if visit.family.senses[way].is_some() {
+            answers[way] = &mut hits[..count];
+        }
+    }
+    let spans = spans(&shift_c[start..end], strip.start[1], strip.tile);
+    let asked = answers.each_mut().map(|a| &mut **a);
+    scan::both(
+        level,
+        sheet,
+        &spans,
+        start - first..end - first,
+        visit.reach,
+        asked,
+        room.rows,
+        room.stack,
+        room.turned,
+    );
+    let [forward, backward] = answers;
+    sink.add(visit, strip, forward, backward);
+}
+
 /// The planes of each lane that lie inside the tile.
 fn spans(shift_c: &[i32], s_c: i64, tile: &Region) -> Spans {
     let (least, most) = span(shift_c);
-    let mut spans = [[0, shift_c.len() as u32]; LANES];
+    let n = shift_c.len();
+    let mut spans = [[0, n as u32]; LANES];
     if s_c + least >= tile.lo[2] && s_c + most + LANES as i64 <= tile.hi[2] {
         return spans;
     }
+    // Lines of higher lanes enter and leave earlier where the displacement rises, later where it falls.
+    let rising = shift_c[0] <= shift_c[n - 1];
+    let passes = |bound: i64, lane: usize| {
+        let least = bound - s_c - lane as i64;
+        move |i: usize| shift_c[i] as i64 >= least
+    };
+    let (mut lo, mut hi) = if rising { (n, n) } else { (0, 0) };
     for (lane, span) in spans.iter_mut().enumerate() {
-        let inside = planes_inside(shift_c, 0..shift_c.len(), s_c + lane as i64, tile.lo[2], tile.hi[2]);
-        *span = [inside.start as u32, inside.end as u32];
+        let (above, beyond) = (passes(tile.lo[2], lane), passes(tile.hi[2], lane));
+        if rising {
+            while lo > 0 && above(lo - 1) {
+                lo -= 1;
+            }
+            while hi > 0 && beyond(hi - 1) {
+                hi -= 1;
+            }
+            *span = [lo as u32, hi as u32];
+        } else {
+            while lo < n && beyond(lo) {
+                lo += 1;
+            }
+            while hi < n && above(hi) {
+                hi += 1;
+            }
+            *span = [lo as u32, hi as u32];
+        }
     }
     spans
 }

@@ -1,6 +1,7 @@
 //! Voxels as unsigned keys in the order of their density, in a padded copy that every line can read without a test.
 
 use crate::grid::{Region, Shape, View, Voxel};
+use crate::multiversion;
 
 /// Lines that are swept together, and zeros around every row of a [`Volume`].
 pub(super) const LANES: usize = 64;
@@ -129,53 +130,89 @@ impl<'a, K: Key> Volume<'a, K> {
     }
 }
 
-/// Fills a padded copy in natural order and returns the least and largest key of voxels that are not missing.
-pub(super) fn encode<T: Coded>(
-    src: View<T>,
-    missing: Option<i64>,
-    flipped: bool,
-    out: &mut [T::Key],
-) -> (T::Key, T::Key) {
-    let (row, plane) = strides(src.shape);
-    let missing = missing_of::<T>(missing);
-    let (mut lo, mut hi) = (T::Key::MAX, T::Key::ZERO);
-    out.fill(T::Key::ZERO);
-    for z in 0..src.shape[0] {
-        for y in 0..src.shape[1] {
-            let to = &mut out[LANES + z * plane + y * row..][..src.shape[2]];
-            for (to, &v) in to.iter_mut().zip(src.row_at(z, y)) {
-                let gone = is_missing(v, missing);
-                let key = if flipped { v.code().not() } else { v.code() };
-                lo = lo.min(if gone { T::Key::MAX } else { key });
-                *to = if gone { T::Key::ZERO } else { key };
-                hi = hi.max(*to);
-            }
-        }
-    }
-    (lo, hi)
+/// The map from voxels of a volume to keys.
+#[derive(Clone, Copy)]
+pub(super) struct Code<T> {
+    pub missing: Option<T>,
+    pub flipped: bool,
 }
 
-/// Fills a padded copy in `[x, y, z]` order from one in natural order.
-pub(super) fn swap<K: Key>(src: &[K], shape: Shape, out: &mut [K]) {
-    const TILE: usize = 16;
-    let swapped = [shape[2], shape[1], shape[0]];
-    let ((row, plane), (to_row, to_plane)) = (strides(shape), strides(swapped));
-    out.fill(K::ZERO);
-    for y in 0..shape[1] {
-        for z0 in (0..shape[0]).step_by(TILE) {
-            let nz = TILE.min(shape[0] - z0);
-            for x0 in (0..shape[2]).step_by(TILE) {
-                let nx = TILE.min(shape[2] - x0);
-                let mut tile = [[K::ZERO; TILE]; TILE];
-                for z in 0..nz {
-                    let from = &src[LANES + (z0 + z) * plane + y * row + x0..][..nx];
-                    tile[z][..nx].copy_from_slice(from);
-                }
-                for x in 0..nx {
-                    let to = &mut out[LANES + (x0 + x) * to_plane + y * to_row + z0..][..nz];
-                    for (to, from) in to.iter_mut().zip(&tile) {
-                        *to = from[x];
+impl<T: Coded> Code<T> {
+    #[inline(always)]
+    fn key(self, v: T) -> T::Key {
+        match (is_missing(v, self.missing), self.flipped) {
+            (true, _) => T::Key::ZERO,
+            (false, true) => v.code().not(),
+            (false, false) => v.code(),
+        }
+    }
+}
+
+#[inline(always)]
+fn least_of<T: Coded>(of: View<T>, code: Code<T>) -> T::Key {
+    let mut least = T::Key::MAX;
+    for row in (0..of.shape[0]).flat_map(|z| (0..of.shape[1]).map(move |y| of.row_at(z, y))) {
+        for &v in row {
+            least = least.min(if is_missing(v, code.missing) { T::Key::MAX } else { code.key(v) });
+        }
+    }
+    least
+}
+
+multiversion! {
+    /// Fills a padded copy in natural order and returns the greatest key.
+    pub(super) fn encode['a, T: Coded](src: View<'a, T>, code: Code<T>, out: &mut [T::Key]) -> T::Key = natural;
+}
+multiversion! {
+    /// Fills a padded copy in `[x, y, z]` order.
+    pub(super) fn encode_turned['a, T: Coded](src: View<'a, T>, code: Code<T>, out: &mut [T::Key]) -> () = turned;
+}
+multiversion! {
+    /// Least key of the voxels of a box that are not missing, the greatest possible one if there are none.
+    pub(super) fn least['a, T: Coded](of: View<'a, T>, code: Code<T>) -> T::Key = least_of;
+}
+
+#[inline(always)]
+fn natural<T: Coded>(src: View<T>, code: Code<T>, out: &mut [T::Key]) -> T::Key {
+    let (row, plane) = strides(src.shape);
+    let mut most = T::Key::ZERO;
+    let [nz, ny, nx] = src.shape;
+    // Each row with the zeros before it, so that the copy is written once.
+    let mut written = 0;
+    for z in 0..nz {
+        for y in 0..ny {
+            let start = LANES + z * plane + y * row;
+            out[written..start].fill(T::Key::ZERO);
+            for (to, &v) in out[start..][..nx].iter_mut().zip(src.row_at(z, y)) {
+                *to = code.key(v);
+                most = most.max(*to);
+            }
+            written = start + nx;
+        }
+    }
+    out[written..].fill(T::Key::ZERO);
+    most
+}
+
+#[inline(always)]
+fn turned<T: Coded>(src: View<T>, code: Code<T>, out: &mut [T::Key]) {
+    const TILE: usize = 64;
+    let [nz, ny, nx] = src.shape;
+    let (row, plane) = strides([nx, ny, nz]);
+    out.fill(T::Key::ZERO);
+    for y in 0..ny {
+        for z0 in (0..nz).step_by(TILE) {
+            let tz = TILE.min(nz - z0);
+            for x0 in (0..nx).step_by(16) {
+                let tx = 16.min(nx - x0);
+                let mut tile = [[T::Key::ZERO; TILE]; 16];
+                for z in 0..tz {
+                    for (to, &v) in tile.iter_mut().zip(&src.row_at(z0 + z, y)[x0..][..tx]) {
+                        to[z] = code.key(v);
                     }
+                }
+                for (x, from) in tile[..tx].iter().enumerate() {
+                    out[LANES + (x0 + x) * plane + y * row + z0..][..tz].copy_from_slice(&from[..tz]);
                 }
             }
         }

@@ -5,7 +5,7 @@
 //! | `lines` | directions to families of lines, distances, fixed-point contributions |
 //! | `keys` | voxels to padded, order-preserving unsigned keys |
 //! | `driver` | tiles, sheets, senses |
-//! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide`: by AVX-512 |
+//! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide` and `turn`: by AVX-512 |
 //! | `sinks`, `contribute` | what is summed |
 //! | `reference` | all of it by the definition |
 
@@ -22,6 +22,8 @@ mod sinks;
 #[cfg(test)]
 mod tests;
 #[cfg(target_arch = "x86_64")]
+mod turn;
+#[cfg(target_arch = "x86_64")]
 mod wide;
 
 use super::Context;
@@ -29,7 +31,7 @@ use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::simd::Level;
 use crate::stage::{DirectionSet, DirectionWeights, Rho};
 use crate::with_view;
-use driver::{Buffers, FRAMES, in_frame};
+use driver::{Buffers, FRAMES, TOGETHER, in_frame};
 use keys::{Coded, Key, LANES, Plain, Volume};
 use sinks::{OpenSum, Sink, WeightedSum};
 
@@ -88,7 +90,8 @@ impl Prepared {
     pub fn new(params: &ObscuranceParams) -> Prepared {
         assert!(params.spacing.iter().all(|s| *s > 0.0 && s.is_finite()), "spacing {:?}", params.spacing);
         assert!(params.max_distance >= 0.0, "max_distance {}", params.max_distance);
-        let (families, total) = lines::families(params);
+        let (mut families, total) = lines::families(params);
+        driver::sort(&mut families);
         Prepared { params: params.clone(), families, total }
     }
 
@@ -121,8 +124,10 @@ impl Prepared {
         let tile: Shape = std::array::from_fn(|a| TILE[a].min(dst[a]));
         let planes = |f: &lines::Family| (tile[f.axis] + 2 * driver::reach_in(f, src[f.axis])).min(src[f.axis]);
         let turned = self.families.iter().any(|f| f.axis == 2);
+        let copies = [keys::padded_len(src), if turned { keys::padded_len(FRAMES[1].map(|a| src[a])) } else { 0 }];
         Sizes {
-            keys: [keys::padded_len(src), if turned { keys::padded_len(FRAMES[1].map(|a| src[a])) } else { 0 }],
+            keys: if tile == dst { [copies[0].max(copies[1]), 0] } else { copies },
+            sums: FRAMES.map(|frame| sinks::sums_len(tile, frame)),
             tile: tile.iter().product(),
             sheet: self.families.iter().map(planes).max().unwrap_or(0),
             queries: tile.into_iter().max().unwrap_or(0),
@@ -147,24 +152,35 @@ impl Prepared {
         let (stack, bytes) = carve::<u32>(bytes, sizes.sheet);
         let (starts, bytes) = carve::<usize>(bytes, sizes.sheet);
         let (turned, bytes) = carve::<u8>(bytes, sizes.turned(size_of::<T>()));
-        let (shifts, bytes) = carve_all::<i32, 2>(bytes, sizes.extent);
-        let (tables, bytes) = carve_all::<u32, 2>(bytes, sizes.extent + 1);
+        let (shifts, bytes) = carve_all::<i32, { 1 + TOGETHER }>(bytes, sizes.extent);
+        let (forward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
+        let (backward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
 
-        let (least, most) = keys::encode(src, self.params.missing, self.params.flipped, natural);
-        let flat = least >= most; // nothing is greater than anything
-        if !flat && !swapped.is_empty() {
-            keys::swap(natural, src_box.shape(), swapped);
-        }
+        let missing = keys::missing_of::<T>(self.params.missing);
+        let code = keys::Code { missing, flipped: self.params.flipped };
+        let level = cx.level;
+        let most = keys::encode(level, src, code, natural);
+        let at = src_box.offset_of(&dst_box);
+        // Nothing is greater than any voxel that is asked for.
+        let flat = keys::least(level, src.part(at, dst_box.shape()), code) >= most;
+        let encode = |frame: usize, out: &mut [T::Key]| match frame {
+            0 => _ = keys::encode(level, src, code, out),
+            _ => keys::encode_turned(level, src, code, out),
+        };
         let mut pass = Pass {
             prepared: self,
             level: cx.level,
             flat,
-            volumes: [natural, swapped],
+            keys: Keys {
+                shared: swapped.is_empty(),
+                copies: [natural, swapped],
+                hold: [Some(0), None],
+                encode: &encode,
+            },
             src_box,
             dst_box,
-            buffers: Buffers { sheet, hits, stack, starts, turned, shifts, tables },
+            buffers: Buffers { sheet, hits, stack, starts, turned, shifts, tables: [forward, backward] },
         };
-        let missing = keys::missing_of::<T>(self.params.missing);
         // NaN where a voxel of the row that starts at `p` is missing.
         let gone = |p: [i64; 3], row: &mut [f32]| {
             let [z, y, x] = [0, 1, 2].map(|a| (p[a] - src_box.lo[a]) as usize);
@@ -182,10 +198,30 @@ struct Pass<'a, K> {
     level: Level,
     /// Nothing is greater than anything.
     flat: bool,
-    volumes: [&'a [K]; 2],
+    keys: Keys<'a, K>,
     src_box: Region,
     dst_box: Region,
     buffers: Buffers<'a, K>,
+}
+
+/// Padded copies of the source in the order of each frame. A sweep of one tile needs one after the other, in one place.
+struct Keys<'a, K> {
+    copies: [&'a mut [K]; 2],
+    shared: bool,
+    /// The frame that each copy is in.
+    hold: [Option<usize>; 2],
+    encode: &'a dyn Fn(usize, &mut [K]),
+}
+
+impl<K> Keys<'_, K> {
+    fn in_frame(&mut self, frame: usize) -> &[K] {
+        let place = if self.shared { 0 } else { frame };
+        if self.hold[place] != Some(frame) {
+            (self.encode)(frame, self.copies[place]);
+            self.hold[place] = Some(frame);
+        }
+        self.copies[place]
+    }
 }
 
 impl<K: Key> Pass<'_, K> {
@@ -201,7 +237,10 @@ impl<K: Key> Pass<'_, K> {
         for cell in cells.iter() {
             let tile = Region::of_cell(cell, dst_box.lo, TILE).clip(&dst_box);
             let voxels = tile.voxels();
-            let (sums, rest) = carve_all::<u32, 2>(&mut *bytes, if fast { voxels } else { 0 });
+            let len = |frame: usize| if fast { sinks::sums_len(tile.shape(), FRAMES[frame]) } else { 0 };
+            let (natural, rest) = carve::<u32>(&mut *bytes, len(0));
+            let (turned, rest) = carve::<u32>(rest, len(1));
+            let sums = [natural, turned];
             let (wide, _) = carve_all::<i64, 5>(rest, if weighted { voxels } else { 0 });
             let mut fast_sum = OpenSum { level: self.level, sums, tile };
             fast_sum.clear();
@@ -241,12 +280,10 @@ impl<K: Key> Pass<'_, K> {
                 let gone = |row: &mut [f32]| gone([tile.lo[0] + z as i64, tile.lo[1] + y as i64, tile.lo[2]], row);
                 if let Some(out) = &mut openness {
                     let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
-                    for (x, out) in row.iter_mut().enumerate() {
-                        *out = match fast {
-                            true if self.flat => 1.0,
-                            true => fast_sum.openness(first + x, total),
-                            false => wide_sum.openness(first + x),
-                        };
+                    match fast {
+                        true if self.flat => row.fill(1.0),
+                        true => fast_sum.openness([z, y], total, row),
+                        false => row.iter_mut().zip(first..).for_each(|(out, i)| *out = wide_sum.openness(i)),
                     }
                     gone(row);
                 }
@@ -262,12 +299,11 @@ impl<K: Key> Pass<'_, K> {
     }
 
     fn sweep_tile<S: Sink>(&mut self, tile: Region, sink: &mut S) {
-        for family in &self.prepared.families {
-            // Answers are "open" wherever nothing is in reach.
-            let reach = if self.flat { 0 } else { driver::reach_in(family, self.src_box.shape()[family.axis]) };
-            let frame = usize::from(family.axis == 2);
-            let volume = Volume::new(self.volumes[frame], in_frame(self.src_box, FRAMES[frame]));
-            driver::sweep_family(self.level, family, reach, volume, tile, &mut self.buffers, sink);
+        for group in driver::groups(&self.prepared.families) {
+            let frame = driver::frame_of(&group[0]);
+            let volume = Volume::new(self.keys.in_frame(frame), in_frame(self.src_box, FRAMES[frame]));
+            let most = if self.flat { 0 } else { usize::MAX };
+            driver::sweep_group(self.level, group, most, volume, tile, &mut self.buffers, sink);
         }
     }
 }
@@ -281,9 +317,10 @@ fn f32_view(view: AnyViewMut) -> ViewMut<f32> {
 
 /// Elements of the parts of the scratch.
 struct Sizes {
-    /// Padded copies: natural, and with x and z exchanged.
+    /// Padded copies: natural, and with x and z exchanged, or one in the place of both.
     keys: [usize; 2],
-    /// Voxels of a tile.
+    /// Sums of both frames of a tile, and its voxels.
+    sums: [usize; 2],
     tile: usize,
     /// Planes of a sheet.
     sheet: usize,
@@ -311,9 +348,9 @@ impl Sizes {
             + line(self.sheet * 4)
             + line(self.sheet * size_of::<usize>())
             + line(self.turned(key))
-            + 2 * line(self.extent * 4)
-            + 2 * line((self.extent + 1) * 4)
-            + if normal { 0 } else { 2 * line(self.tile * 4) }
+            + (1 + TOGETHER) * line(self.extent * 4)
+            + 2 * TOGETHER * line((self.extent + 1) * 4)
+            + if normal { 0 } else { line(self.sums[0] * 4) + line(self.sums[1] * 4) }
             + if normal || colour { 5 * line(self.tile * 8) } else { 0 }
     }
 }

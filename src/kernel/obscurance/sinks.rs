@@ -1,10 +1,13 @@
 //! What a sweep accumulates. The driver hands every sink the answers of both senses for a piece of a row; sums are
 //! integers, so that order never matters.
 
+use std::ops::Range;
+
 use super::contribute::{self, ByteTables};
+use super::keys::LANES;
 use super::lines::Family;
 use super::scan::Hit;
-use crate::grid::{Region, View};
+use crate::grid::{Region, Shape, View};
 use crate::kernel::simd::Level;
 
 /// Constants of one family in one brick.
@@ -24,31 +27,79 @@ pub(super) struct Visit<'a> {
     pub origin: i64,
 }
 
-/// A piece of a row of the output tile.
-pub(super) struct Piece {
-    /// Global frame indices of its first voxel.
-    pub at: [i64; 3],
+/// The queries of a sheet: a row of 64 lanes for each of its planes, of which some lanes lie inside the tile.
+pub(super) struct Strip<'a> {
     /// Frame axis along which lines run (0 or 1).
     pub axis: usize,
+    /// Counted from the first plane of the source.
+    pub planes: Range<usize>,
+    /// Frame indices that displacements are added to: along the other one of the first two axes, and of lane 0 along
+    /// the last axis.
+    pub start: [i64; 2],
+    /// The output tile, in frame order.
+    pub tile: &'a Region,
 }
 
-/// Accumulates answers. `forward` and `backward` hold one answer per voxel of the piece; they are empty for a sense that
-/// is not swept.
+/// A piece of a row of the output tile.
+pub(super) struct Piece {
+    /// Global frame indices of its first voxel: along the lines, along the other one of the first two axes, and along
+    /// the last.
+    pub along: i64,
+    pub across: i64,
+    pub from: i64,
+    /// Where its voxels stand among the answers of the strip.
+    pub answers: Range<usize>,
+}
+
+impl Strip<'_> {
+    /// The pieces of the planes of the strip, without those outside of the tile.
+    #[inline(always)]
+    pub fn pieces(&self, visit: &Visit) -> impl Iterator<Item = Piece> {
+        let shifts = visit.shifts.map(|s| &s[self.planes.clone()]);
+        let origin = visit.origin + self.planes.start as i64;
+        let ([s_b, s_c], [lo, hi]) = (self.start, [self.tile.lo[2], self.tile.hi[2]]);
+        shifts[0].iter().zip(shifts[1]).enumerate().filter_map(move |(row, (&d_b, &d_c))| {
+            let start = s_c + d_c as i64;
+            let (from, to) = (start.max(lo), (start + LANES as i64).min(hi));
+            let first = row * LANES;
+            let answers = first + (from - start) as usize..first + (to - start) as usize;
+            let (along, across) = (origin + row as i64, s_b + d_b as i64);
+            (from < to).then_some(Piece { along, across, from, answers })
+        })
+    }
+}
+
+/// Accumulates answers.
 pub(super) trait Sink {
-    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]);
-    /// Told of each piece some time before it comes, so that its sums can be fetched.
-    fn expect(&self, _visit: &Visit, _piece: &Piece) {}
+    /// `forward` and `backward` hold [`LANES`] answers per plane of the strip; they are empty for a sense that is not
+    /// swept. Answers of voxels outside of the tile may be anything.
+    fn add<H: Hit>(&mut self, visit: &Visit, strip: &Strip, forward: &[H], backward: &[H]);
+    /// Told of a strip before its lines are searched, so that its sums can be fetched.
+    fn expect(&self, _visit: &Visit, _strip: &Strip) {}
 }
 
 impl<A: Sink, B: Sink> Sink for (A, B) {
     #[inline(always)]
-    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
-        self.0.add(visit, piece, forward, backward);
-        self.1.add(visit, piece, forward, backward);
+    fn add<H: Hit>(&mut self, visit: &Visit, strip: &Strip, forward: &[H], backward: &[H]) {
+        self.0.add(visit, strip, forward, backward);
+        self.1.add(visit, strip, forward, backward);
     }
-    fn expect(&self, visit: &Visit, piece: &Piece) {
-        self.0.expect(visit, piece);
+    fn expect(&self, visit: &Visit, strip: &Strip) {
+        self.0.expect(visit, strip);
     }
+}
+
+/// Row and plane strides of the sums of a tile of extents `n`: sheets cross the planes, which would fall into a few
+/// cache sets if they stood a multiple of a page apart. Grows with the extents.
+fn strides(n: Shape) -> [usize; 2] {
+    let plane = n[1] * n[2];
+    [n[2], if plane < 1024 { plane } else { plane.next_multiple_of(1024) + 272 }]
+}
+
+/// Sums that a tile of extents `n` needs for the frame `perm`.
+pub(super) fn sums_len(n: Shape, perm: [usize; 3]) -> usize {
+    let n = perm.map(|a| n[a]);
+    n[0] * strides(n)[1]
 }
 
 /// Openness with weights that depend on the direction only. One buffer for each frame, each in the frame's order.
@@ -69,16 +120,17 @@ impl OpenSum<'_> {
         const TILE: usize = 16;
         let [nz, ny, nx] = self.tile.shape();
         let [natural, turned] = &mut self.sums;
+        let ([row, plane], [to_row, to_plane]) = (strides([nx, ny, nz]), strides([nz, ny, nx]));
         for y in 0..ny {
             for z0 in (0..nz).step_by(TILE) {
                 for x0 in (0..nx).step_by(TILE) {
                     let (tz, tx) = (TILE.min(nz - z0), TILE.min(nx - x0));
                     let mut part = [[0; TILE]; TILE];
                     for (x, part) in part[..tx].iter_mut().enumerate() {
-                        part[..tz].copy_from_slice(&turned[((x0 + x) * ny + y) * nz + z0..][..tz]);
+                        part[..tz].copy_from_slice(&turned[(x0 + x) * plane + y * row + z0..][..tz]);
                     }
                     for z in 0..tz {
-                        let to = &mut natural[((z0 + z) * ny + y) * nx + x0..][..tx];
+                        let to = &mut natural[(z0 + z) * to_plane + y * to_row + x0..][..tx];
                         for (to, part) in to.iter_mut().zip(&part) {
                             *to += part[z];
                         }
@@ -88,39 +140,36 @@ impl OpenSum<'_> {
         }
     }
 
-    /// Where the sums of a piece start in the buffer of its frame.
-    #[inline(always)]
-    fn start(&self, visit: &Visit, piece: &Piece) -> usize {
-        let [_, b, c] = visit.perm;
-        let n = self.tile.shape();
-        let at = |k: usize| (piece.at[k] - self.tile.lo[visit.perm[k]]) as usize;
-        (at(0) * n[b] + at(1)) * n[c] + at(2)
-    }
-
-    /// Openness of voxel `i` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes.
-    pub fn openness(&self, i: usize, total: u64) -> f32 {
-        (self.sums[0][i] as f64 / total as f64) as f32
+    /// Openness of row `[z, y]` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes.
+    pub fn openness(&self, [z, y]: [usize; 2], total: u64, out: &mut [f32]) {
+        let [row, plane] = strides(self.tile.shape());
+        for (out, &sum) in out.iter_mut().zip(&self.sums[0][z * plane + y * row..]) {
+            *out = (sum as f64 / total as f64) as f32;
+        }
     }
 }
 
 impl Sink for OpenSum<'_> {
-    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
-        let start = self.start(visit, piece);
-        let len = forward.len().max(backward.len());
-        let sums = &mut self.sums[usize::from(visit.perm[2] == 0)][start..start + len];
-        contribute::add(self.level, sums, forward, backward, visit);
+    fn add<H: Hit>(&mut self, visit: &Visit, strip: &Strip, forward: &[H], backward: &[H]) {
+        let strides = strides(visit.perm.map(|a| self.tile.shape()[a]));
+        let sums = &mut *self.sums[usize::from(visit.perm[2] == 0)];
+        contribute::add(self.level, sums, strides, forward, backward, visit, strip);
     }
 
     #[inline(always)]
-    fn expect(&self, visit: &Visit, piece: &Piece) {
+    fn expect(&self, visit: &Visit, strip: &Strip) {
         #[cfg(target_arch = "x86_64")]
-        for line in 0..5 {
+        for piece in strip.pieces(visit) {
             use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+            let strides = strides(visit.perm.map(|a| self.tile.shape()[a]));
             let sums = self.sums[usize::from(visit.perm[2] == 0)].as_ptr();
-            // SAFETY: prefetching touches nothing, wherever the address points; every x86-64 has SSE.
-            unsafe { _mm_prefetch::<_MM_HINT_T1>(sums.wrapping_add(self.start(visit, piece) + 16 * line).cast()) };
+            let sums = sums.wrapping_add(contribute::start(strides, strip, &piece));
+            for line in 0..5 {
+                // SAFETY: prefetching touches nothing, wherever the address points; every x86-64 has SSE.
+                unsafe { _mm_prefetch::<_MM_HINT_T1>(sums.wrapping_add(16 * line).cast()) };
+            }
         }
-        let _ = (visit, piece);
+        let _ = (visit, strip);
     }
 }
 
@@ -233,19 +282,20 @@ fn occluder(visit: &Visit, way: usize, p: [i64; 3], steps: usize, axis: usize) -
 
 impl Sink for WeightedSum<'_> {
     #[inline(always)]
-    fn add<H: Hit>(&mut self, visit: &Visit, piece: &Piece, forward: &[H], backward: &[H]) {
-        for i in 0..forward.len().max(backward.len()) {
-            let mut p = [0; 3];
-            for k in 0..3 {
-                p[visit.perm[k]] = piece.at[k] + if k == 2 { i as i64 } else { 0 };
-            }
-            let normal = self.normal.as_ref().map_or([0.0; 3], |n| {
-                let at = std::array::from_fn(|a| (p[a] - self.dst_box.lo[a]) as usize);
-                normal_at(n, at, self.flipped)
-            });
-            for (way, answers) in [forward, backward].into_iter().enumerate() {
-                if let Some(answer) = answers.get(i) {
-                    self.one(visit, way, p, normal, answer.steps(), piece.axis);
+    fn add<H: Hit>(&mut self, visit: &Visit, strip: &Strip, forward: &[H], backward: &[H]) {
+        for piece in strip.pieces(visit) {
+            for (i, answer) in piece.answers.clone().enumerate() {
+                let mut p = [piece.from + i as i64; 3];
+                p[visit.perm[strip.axis]] = piece.along;
+                p[visit.perm[1 - strip.axis]] = piece.across;
+                let normal = self.normal.as_ref().map_or([0.0; 3], |n| {
+                    let at = std::array::from_fn(|a| (p[a] - self.dst_box.lo[a]) as usize);
+                    normal_at(n, at, self.flipped)
+                });
+                for (way, answers) in [forward, backward].into_iter().enumerate() {
+                    if let Some(answer) = answers.get(answer) {
+                        self.one(visit, way, p, normal, answer.steps(), strip.axis);
+                    }
                 }
             }
         }

@@ -136,8 +136,9 @@ fn every_search_finds_the_next_greater_key() {
                 let steps = free.by_ref().count();
                 if steps < reach && at(steps + 1) < planes { steps } else { reach }
             };
-            let starts: Vec<usize> = (0..planes).map(|i| i * LANES).collect();
-            let place = super::scan::Sheet { data: &sheet, planes: &starts };
+            let starts: Vec<usize> = (1..=planes).map(|i| i * LANES).collect();
+            let data = [vec![K::ZERO; LANES], sheet.clone()].concat();
+            let place = super::scan::Sheet { data: &data, planes: &starts };
             let mut stack = vec![0; planes];
             let mut rows = sheet.clone();
             let spans = [[0, (to - from) as u32]; LANES];
