@@ -28,8 +28,8 @@ pub const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
 /// Why the beta distribution stays on the CPU.
 pub const BETA: &str = "no GPU kernel for method \"beta\": runs on the CPU";
 
-/// Bricks that are on the GPU at once: one computes while the host copies for the other.
-pub const SLOTS: u64 = 2;
+/// Bricks that are on the GPU's way at once: one is packed, one computes, one is read back and finished.
+pub const SLOTS: u64 = 3;
 
 impl GpuFacts {
     /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to seven buffers' worth
@@ -55,6 +55,16 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
         DType::U32 | DType::I32 => Err("no GPU kernel that sums 32-bit integers exactly: runs on the CPU"),
         DType::F32 => Err("no GPU kernel that holds SPEC 5.6 for f32: runs on the CPU"),
         DType::F64 => Err("no GPU kernel that holds SPEC 5.6 for f64: runs on the CPU"),
+    }
+}
+
+/// Whether obscurance of this type has a GPU kernel, or why not. `plain`: openness alone, with weights that depend on the
+/// direction only.
+pub fn obscurance(dtype: DType, plain: bool) -> Result<(), &'static str> {
+    match dtype {
+        _ if !plain => Err("no GPU kernel for colour bleeding and weight_by_normal: runs on the CPU"),
+        DType::F64 => Err("no GPU kernel that orders f64: runs on the CPU"),
+        _ => Ok(()),
     }
 }
 

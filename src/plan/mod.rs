@@ -143,6 +143,10 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     let channels = match &step.kind {
         graph::StepKind::Window { channels, .. } => channels,
         graph::StepKind::Rank { .. } => return Err(facts::EXACT),
+        graph::StepKind::Obscurance { channels, normal, .. } => {
+            let plain = normal.is_none() && channels[..] == [graph::ObscuranceChannel::Openness];
+            return facts::obscurance(input.dtype, plain);
+        }
         _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
     };
     if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {

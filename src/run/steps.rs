@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use super::value::{Comp, Value};
 use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, GpuError};
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut, Voxel};
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::simd::Level;
@@ -184,16 +184,16 @@ impl<'a> Engine<'a> {
             StepKind::Obscurance { channels, colour, normal, .. } => {
                 let sweep = &self.sweeps[&id];
                 self.sweep(
+                    id,
                     sweep,
                     channels,
-                    colour.is_some(),
-                    normal.is_some(),
+                    [colour.is_some(), normal.is_some()],
                     inputs,
                     &mut outputs,
                     region,
                     volume,
                     &mut cx,
-                );
+                )?;
             }
             StepKind::Gradient { size, weight, spacing, channels, stored } => {
                 let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
@@ -226,6 +226,7 @@ impl<'a> Engine<'a> {
     /// Window, rank or Gaussian of one component.
     fn windows(&self, id: StepId, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) -> Result<()> {
         let step = &self.plan.graph.steps[id];
+        let region = outputs[0].region;
         match &step.kind {
             StepKind::Window { params, channels } => {
                 let params = WindowParams { missing: src.missing, ..*params };
@@ -234,12 +235,11 @@ impl<'a> Engine<'a> {
                     .zip(outputs)
                     .map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, c) })
                     .collect();
-                // A single voxel stands for a constant brick: not worth the way to the device, and the bits are the same.
-                let single = outs.iter().all(|o| o.dst.shape() == [1, 1, 1]);
-                match self.gpu.filter(|_| self.plan.on_gpu(id) && !single) {
-                    Some(gpu) => gpu.window(src.view(), &params, src.at, &mut outs, cx).map(|_| ()).map_err(|e| {
-                        Error::Failed(format!("{} on the GPU: {e}; --resume continues", step.stages.join("+")))
-                    })?,
+                match self.lane(id, region) {
+                    Some(gpu) => {
+                        let done = gpu.window(src.view(), &params, src.at, &mut outs, cx);
+                        done.map_err(|e| self.gpu_failed(id, &e))?;
+                    }
                     None => window::window(src.view(), &params, src.at, &mut outs, cx),
                 }
             }
@@ -265,16 +265,16 @@ impl<'a> Engine<'a> {
     #[allow(clippy::too_many_arguments)]
     fn sweep(
         &self,
+        id: StepId,
         sweep: &Prepared,
         channels: &[ObscuranceChannel],
-        has_colour: bool,
-        has_normal: bool,
+        [has_colour, has_normal]: [bool; 2],
         inputs: &[&Value],
         outputs: &mut [Value],
         region: Region,
         volume: Region,
         cx: &mut Context,
-    ) {
+    ) -> Result<()> {
         let src_box = region.grow(sweep.reach()).clip(&volume);
         // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
         let colour = has_colour.then(|| std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(inputs[1].view(c, src_box))));
@@ -299,13 +299,32 @@ impl<'a> Engine<'a> {
                 ObscuranceChannel::Rgb => io.rgb = Some(three(views)),
             }
         }
-        sweep.sweep(inputs[0].view(0, src_box), src_box, region, io, cx);
+        let src = inputs[0].view(0, src_box);
+        match (self.lane(id, region), &mut io.openness) {
+            (Some(gpu), Some(AnyViewMut::F32(openness))) => {
+                let done = gpu.obscurance(sweep, src, src_box, region, openness, cx);
+                done.map_err(|e| self.gpu_failed(id, &e))?;
+            }
+            _ => sweep.sweep(src, src_box, region, io, cx),
+        }
         for (from, to) in narrow_outputs.into_iter().zip(outputs) {
             for c in 0..from.comps.len() {
                 pointwise::scale(from.view(c, region), Affine::IDENTITY, None, view_mut(to, c));
             }
             from.recycle(self.pool);
         }
+        Ok(())
+    }
+
+    /// The GPU, where it is to run a step on this box. A single voxel stands for a constant brick: not worth the way to the
+    /// device, and the bits are the same.
+    fn lane(&self, id: StepId, region: Region) -> Option<&'a Gpu> {
+        self.gpu.filter(|_| self.plan.on_gpu(id) && region.shape() != [1, 1, 1])
+    }
+
+    fn gpu_failed(&self, id: StepId, error: &GpuError) -> Error {
+        let step = &self.plan.graph.steps[id];
+        Error::Failed(format!("{} on the GPU: {error}; --resume continues", step.stages.join("+")))
     }
 
     /// Uninitialised voxels for a value.
