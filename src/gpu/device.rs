@@ -97,6 +97,7 @@ pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
         name: info.name.clone(),
         software: info.device_type == wgpu::DeviceType::Cpu,
         most_bytes: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(1 << 30),
+        exact_floats: false, // until the probe has said so
     };
     let tick = timed.then(|| queue.get_timestamp_period() as f64);
     let kernels = kernels(&device)?;

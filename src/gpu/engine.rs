@@ -1,6 +1,7 @@
 //! Runs recordings on the device: map, fill, submit, map, finish; opens a lost device anew and tries once more.
 
 use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
@@ -45,6 +46,8 @@ pub struct Gpu {
     /// Most bytes of one buffer; larger calls are cut.
     cap: u64,
     device: Mutex<Option<Arc<Device>>>,
+    /// No device can be opened any more (set by tests).
+    gone: AtomicBool,
 }
 
 /// Writes voxels into the mapped upload buffer, behind parameters and tables; false where the device has nothing to do.
@@ -66,7 +69,10 @@ impl Gpu {
     fn open_with(kind: GpuKind, timed: bool) -> Result<Gpu, String> {
         let (device, facts) = device::open(kind, timed)?;
         let cap = facts.most_bytes;
-        Ok(Gpu { kind, facts, timed, cap, device: Mutex::new(Some(Arc::new(device))) })
+        let mut gpu =
+            Gpu { kind, facts, timed, cap, device: Mutex::new(Some(Arc::new(device))), gone: AtomicBool::new(false) };
+        gpu.facts.exact_floats = gpu.probe().map_err(|e| format!("{} does not compute: {e}", gpu.facts.name))?;
+        Ok(gpu)
     }
 
     pub fn facts(&self) -> &GpuFacts {
@@ -112,6 +118,9 @@ impl Gpu {
         if let Some(device) = &*held {
             return Ok(device.clone());
         }
+        if self.gone.load(Ordering::Relaxed) {
+            return Err(GpuError("the device was lost, and no other is there".into()));
+        }
         let opened = device::open(self.kind, self.timed);
         let (device, _) = opened.map_err(|e| GpuError(format!("the device was lost; {e}")))?;
         Ok(held.insert(Arc::new(device)).clone())
@@ -125,9 +134,10 @@ impl Gpu {
         }
     }
 
-    /// Destroys the device under the lane, as a driver reset would. For tests.
+    /// Destroys the device under the lane, as a driver reset would, so that it can be opened anew or not. For tests.
     #[doc(hidden)]
-    pub fn lose(&self) {
+    pub fn lose(&self, for_good: bool) {
+        self.gone.store(for_good, Ordering::Relaxed);
         if let Some(device) = &*self.device.lock().unwrap_or_else(|e| e.into_inner()) {
             device.device.destroy();
         }
@@ -278,23 +288,12 @@ fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::Sub
         from += bytes;
     }
     stamp(&mut encoder, 1);
-    let (mut number, mut computed) = (0, false);
+    let mut number = 0;
     let last = recording.commands.iter().rposition(|c| matches!(c, Command::Dispatch(_)));
-    for (at, command) in recording.commands.iter().enumerate() {
-        match command {
-            Command::Dispatch(d) => {
-                dispatch(device, held, d, number * PARAMS_STRIDE, &mut encoder);
-                number += 1;
-            }
-            Command::Readback(r) => {
-                encoder.copy_buffer_to_buffer(slot.of(r.from), 0, slot.read.get(), r.to, r.bytes);
-            }
-        }
-        if Some(at) == last && !computed {
-            computed = true;
-            stamp(&mut encoder, 2);
-        }
-    }
+    let (compute, back) = recording.commands.split_at(last.map_or(0, |l| l + 1));
+    encode(device, held, compute, &mut number, &mut encoder);
+    stamp(&mut encoder, 2);
+    encode(device, held, back, &mut number, &mut encoder);
     stamp(&mut encoder, 3);
     if let Some(set) = &stamps {
         let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
@@ -306,7 +305,33 @@ fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::Sub
     device.queue.submit([encoder.finish()])
 }
 
-fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, encoder: &mut wgpu::CommandEncoder) {
+/// Commands in their order; dispatches in a row share a pass. `number` counts dispatches: their place among parameters.
+fn encode(
+    device: &Device,
+    held: &SlotGuard,
+    commands: &[Command],
+    number: &mut u64,
+    encoder: &mut wgpu::CommandEncoder,
+) {
+    let slot = &held.slot;
+    for run in commands.chunk_by(|a, b| matches!((a, b), (Command::Dispatch(_), Command::Dispatch(_)))) {
+        match &run[0] {
+            Command::Readback(r) => {
+                encoder.copy_buffer_to_buffer(slot.of(r.from), 0, slot.read.get(), r.to, r.bytes);
+            }
+            Command::Dispatch(_) => {
+                let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                for command in run {
+                    let Command::Dispatch(d) = command else { continue };
+                    dispatch(device, held, d, *number * PARAMS_STRIDE, &mut pass);
+                    *number += 1;
+                }
+            }
+        }
+    }
+}
+
+fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, pass: &mut wgpu::ComputePass) {
     let kernel = device.kernel(d.shader);
     let size = wgpu::BufferSize::new(d.params.len() as u64);
     let params = wgpu::BufferBinding { buffer: held.slot.params.get(), offset, size };
@@ -319,9 +344,8 @@ fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, encode
     );
     let desc = wgpu::BindGroupDescriptor { label: None, layout: &kernel.layout, entries: &entries };
     let bind = device.device.create_bind_group(&desc);
-    let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-    compute.set_pipeline(&kernel.pipelines[d.entry]);
-    compute.set_bind_group(0, &bind, &[]);
+    pass.set_pipeline(&kernel.pipelines[d.entry]);
+    pass.set_bind_group(0, &bind, &[]);
     let [x, y] = groups(d.threads);
-    compute.dispatch_workgroups(x, y, 1);
+    pass.dispatch_workgroups(x, y, 1);
 }

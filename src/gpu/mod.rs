@@ -5,21 +5,23 @@
 //! |---|---|
 //! | `facts` | what the planner knows of an adapter; which stages have kernels |
 //! | `record` | the device's work as data: buffers, dispatches, what comes back |
-//! | `passes`, `sweep` | windows and obscurance recorded, cut into parts that fit |
+//! | `passes`, `sweep`, `taps` | windows, obscurance and Gaussians recorded, cut into parts that fit |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
-//! | `windows`, `obscurance` | calls like the CPU kernels' |
+//! | `windows`, `obscurance`, `gaussian` | calls like the CPU kernels' |
 //!
 //! Everything above `device` knows no wgpu.
 
 pub mod device;
 pub mod engine;
 pub mod facts;
+mod gaussian;
 mod obscurance;
 pub mod passes;
 pub mod record;
 mod slot;
 pub mod sweep;
+pub mod taps;
 mod windows;
 
 pub use engine::{Gpu, GpuError, Times};

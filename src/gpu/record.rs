@@ -15,10 +15,12 @@ pub enum Shader {
     Sums32,
     Sums64,
     Obscurance,
+    Gaussian,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 4] = [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance];
+    pub const ALL: [Shader; 5] =
+        [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance, Shader::Gaussian];
 
     /// Name of its file under `shaders/`, without the ending.
     pub fn name(self) -> &'static str {
@@ -27,6 +29,7 @@ impl Shader {
             Shader::Sums32 => "window_sums32",
             Shader::Sums64 => "window_sums64",
             Shader::Obscurance => "obscurance",
+            Shader::Gaussian => "gaussian",
         }
     }
 
@@ -36,6 +39,7 @@ impl Shader {
             Shader::Sums32 => include_str!("../../shaders/window_sums32.wgsl"),
             Shader::Sums64 => include_str!("../../shaders/window_sums64.wgsl"),
             Shader::Obscurance => include_str!("../../shaders/obscurance.wgsl"),
+            Shader::Gaussian => include_str!("../../shaders/gaussian.wgsl"),
         }
     }
 
@@ -50,6 +54,7 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Obscurance => 4,
+            Shader::Gaussian => 3,
             _ => 2,
         }
     }

@@ -43,7 +43,7 @@ impl Gpu {
             let mut times = Times::default();
             for part in &parts {
                 let recording = job.record(part);
-                let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(&job, part, src, out);
+                let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, part, job.pitch(part) * job.voxel, out);
                 let mut done = |bytes: Option<&[u8]>| {
                     let windows = windows(bytes.unwrap_or_default(), part, &job.quantities())?;
                     finish(src, params, job.at, outs, &windows, cx);
@@ -56,8 +56,8 @@ impl Gpu {
     }
 }
 
-/// Writes the voxels of a part, rows padded to whole words; true: there is always work.
-fn pack(job: &Job, part: &Part, src: AnyView, out: &mut wgpu::WriteOnly<[u8]>) -> bool {
+/// Writes the voxels that a part sees, in rows of `pitch` bytes; true: there is always work.
+pub(super) fn pack(src: AnyView, part: &Part, pitch: usize, out: &mut wgpu::WriteOnly<[u8]>) -> bool {
     fn write<T: Voxel + bytemuck::Pod>(v: View<T>, part: &Part, pitch: usize, out: &mut wgpu::WriteOnly<[u8]>) {
         let v = v.part(part.from, part.src);
         for z in 0..part.src[0] {
@@ -69,13 +69,12 @@ fn pack(job: &Job, part: &Part, src: AnyView, out: &mut wgpu::WriteOnly<[u8]>) -
             }
         }
     }
-    let pitch = job.pitch(part) * job.voxel;
     match src {
         AnyView::U8(v) => write(v, part, pitch, out),
         AnyView::I8(v) => write(v, part, pitch, out),
         AnyView::U16(v) => write(v, part, pitch, out),
         AnyView::I16(v) => write(v, part, pitch, out),
-        other => unreachable!("a job of {} is not made", other.dtype()),
+        other => unreachable!("no job is made of {}", other.dtype()),
     }
     true
 }

@@ -3,7 +3,7 @@
 use super::graph::{Step, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
-use crate::gpu::{facts, passes, record, sweep};
+use crate::gpu::{facts, passes, record, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, obscurance, rank, reduce, window};
 
@@ -124,6 +124,10 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
             let job = sweep::SweepJob::new(&prepared, dtype, Region::whole(src), inner);
             job.map_or(record::Sizes::default(), |j| j.slot(cap))
         }
+        StepKind::Gaussian { sigma, .. } => {
+            let job = taps::TapsJob::new(dtype, src, dst, at, *sigma);
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        }
         _ => record::Sizes::default(),
     }
 }
@@ -191,6 +195,6 @@ pub fn in_flight(threads: usize) -> usize {
 
 /// Bytes for decoded chunks when `bricks` bricks of `brick` bytes are alive.
 pub fn cache_bytes(plan: &Plan, brick: u64, bricks: u64, parked: u64) -> u64 {
-    let fixed = FIXED + PER_THREAD * plan.threads as u64;
+    let fixed = FIXED + PER_THREAD * plan.workers as u64;
     plan.memory.saturating_sub(fixed + parked + brick * bricks)
 }

@@ -6,6 +6,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod gaussian;
 mod obscurance;
 mod runs;
 mod windows;

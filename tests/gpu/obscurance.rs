@@ -173,7 +173,7 @@ fn a_lost_device_is_opened_anew() {
     let (name, voxels) = fills(DType::U16, shape).swap_remove(0);
     let v = Placed { voxels: &voxels, shape, lo: [0; 3] };
     check(&gpu, name, &params(12, 4.0), &v, v.region());
-    gpu.lose();
+    gpu.lose(false);
     check(&gpu, name, &params(12, 4.0), &v, v.region());
 }
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use occlude::gpu::GpuFacts;
+use occlude::gpu::{GpuFacts, facts};
 use occlude::plan::Plan;
 use occlude::run::{RunOptions, Session, Silent};
 
@@ -50,6 +50,23 @@ op = "obscurance"
 input = "stats.mean"
 max_distance = 4
 where = { input = "vol", max = 20000 }
+[stage.bell]
+op = "gaussian"
+input = "vol"
+sigma = 1.5
+border = "nearest"
+[stage.bells]
+op = "gaussian"
+input = "vol"
+sigma = 0.8
+[output.bell]
+path = "out/bell.zarr"
+from = "bell.mean"
+chunk = 16
+[output.bells]
+path = "out/bells.zarr"
+from = ["bells.mean", "bells.variance"]
+chunk = 16
 [stage.bleeding]
 op = "obscurance"
 input = "vol"
@@ -114,6 +131,8 @@ fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
     assert_eq!(device("mirrored").as_deref(), Some("gpu"));
     assert_eq!(device("swept").as_deref(), Some("gpu"));
     assert_eq!(device("floats").as_deref(), Some("gpu"));
+    assert_eq!(device("bell").as_deref(), Some("gpu"));
+    assert_eq!(device("bells").as_deref(), Some("cpu"));
     assert_eq!(device("bleeding").as_deref(), Some("cpu"));
     assert_eq!(device("again").as_deref(), Some("cpu"));
     assert_eq!(device("exact").as_deref(), Some("cpu"));
@@ -164,20 +183,24 @@ fn plan_with(device: &str, found: Result<GpuFacts, String>) -> occlude::Result<(
 
 #[test]
 fn placement_follows_the_device_and_says_why() {
-    let facts = |software| GpuFacts { name: "Test 9000".into(), software, most_bytes: 1 << 30 };
+    let found = |software| GpuFacts { name: "Test 9000".into(), software, most_bytes: 1 << 30, exact_floats: software };
     let none = || Err("looked for a driver; found no Vulkan adapter".to_string());
     let on = |plan: &Plan, name: &str| {
         let place = plan.placement.iter().find(|p| p.0 == name).unwrap();
         (place.1, place.2.clone())
     };
-    let (plan, calls) = plan_with("run.device='cpu'", Ok(facts(false))).unwrap();
+    let (plan, calls) = plan_with("run.device='cpu'", Ok(found(false))).unwrap();
     assert_eq!((calls, plan.gpu.is_none()), (0, true));
     let parked = plan.groups[0].brick.parked;
-    let (plan, _) = plan_with("run.device='auto'", Ok(facts(false))).unwrap();
+    let (plan, _) = plan_with("run.device='auto'", Ok(found(false))).unwrap();
     assert_eq!(on(&plan, "stats"), ("gpu", "Test 9000".into()));
+    assert_eq!(on(&plan, "swept"), ("gpu", "Test 9000".into()));
+    assert_eq!(on(&plan, "bell"), ("cpu", facts::INEXACT.into()));
+    assert!(on(&plan, "bells").1.contains("variance") && on(&plan, "bleeding").1.contains("gradients"));
     assert!(on(&plan, "again").1.contains("f32") && on(&plan, "exact").1.contains("exact"));
     let staging = plan.groups[0].brick.parked - parked;
-    let (plan, _) = plan_with("run.device='gpu:software'", Ok(facts(true))).unwrap();
+    let (plan, _) = plan_with("run.device='gpu:software'", Ok(found(true))).unwrap();
+    assert_eq!(on(&plan, "bell"), ("gpu", "Test 9000".into()));
     assert!(staging > 0 && plan.groups[0].brick.parked - parked > staging, "device memory of software counts");
     let (plan, _) = plan_with("run.device='auto'", none()).unwrap();
     assert!(plan.placement.iter().all(|p| p.1 == "cpu"));
@@ -207,4 +230,70 @@ fn without_a_driver_gpu_fails_and_auto_runs_on_the_cpu_and_says_so() {
     let (code, text) = command("auto");
     assert_eq!(code, Some(0), "{text}");
     assert!(text.contains("running on the CPU"), "{text}");
+}
+
+#[test]
+fn many_workers_share_bricks_between_the_lanes() {
+    let Some(_) = adapter() else { return };
+    let (cpu, pure, mixed) = (folder(), folder(), folder());
+    let bricks = "run.brick=[8, 16, 32]";
+    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let run = |dir: &Path, sets: &[&str]| {
+        let config = parse(dir, CONFIG, &[&[SOFTWARE, bricks, "run.threads=8"], sets].concat());
+        let report = run_with(&config, &RunOptions::default());
+        let on_cpu = |name: &str| report.stages.iter().find(|s| s.name == name).map_or(0, |s| s.bricks_on_cpu);
+        (report.byte_identity_waived, ["swept", "floats", "stats", "mirrored", "bell"].map(on_cpu))
+    };
+    let (waived, shared) = run(pure.path(), &[]);
+    assert!(!waived && shared.iter().sum::<u64>() > 0, "8 workers and 3 slots: {shared:?}");
+    assert_eq!(shared[4], 0, "floats stay on one lane");
+    assert_same_outputs("shared", cpu.path(), pure.path());
+    let (waived, _) = run(mixed.path(), &["run.lanes='mixed'"]);
+    assert!(waived);
+    for name in OUTPUTS {
+        let [a, b] = [&cpu, &mixed].map(|d| decode(&d.path().join("out").join(name)));
+        // Waived, yet this adapter's floats are the CPU's.
+        assert_same(&format!("mixed: {name}"), &a, &b);
+    }
+}
+
+#[test]
+fn workers_fill_the_ring_and_its_staging_is_counted() {
+    let facts = GpuFacts { name: "Test 9000".into(), software: false, most_bytes: 1 << 30, exact_floats: true };
+    let (plan, _) = plan_with("run.device='auto'", Ok(facts)).unwrap();
+    assert!(facts::SLOTS >= 3 && plan.threads == 2 && plan.workers == facts::SLOTS as usize);
+    assert!(plan.groups[0].brick.in_flight as u64 > facts::SLOTS);
+    assert!(plan.groups[0].brick.parked as usize > 3 * 40 * 50 * 60 / 8, "three bricks' voxels and sums");
+    let (plan, _) = plan_with("run.device='cpu'", Err("none".into())).unwrap();
+    assert_eq!(plan.workers, 2);
+}
+
+#[test]
+fn a_device_lost_in_a_run_is_opened_anew_or_ends_it_resumable() {
+    let Some(_) = adapter() else { return };
+    let (cpu, once, twice) = (folder(), folder(), folder());
+    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let options = RunOptions { resume: true, ..Default::default() };
+    let config = parse(once.path(), CONFIG, &[SOFTWARE]);
+    let session = Session::open(&config, &options, &Silent).unwrap();
+    let tasks = session.task_count();
+    assert!(tasks > 1);
+    for task in 0..tasks {
+        session.lose_gpu(false);
+        session.run_task(task).unwrap();
+    }
+    session.finish().unwrap();
+    assert_same_outputs("lost and opened anew", cpu.path(), once.path());
+    let config = parse(twice.path(), CONFIG, &[SOFTWARE]);
+    let session = Session::open(&config, &options, &Silent).unwrap();
+    session.run_task(0).unwrap();
+    session.lose_gpu(true);
+    let error = session.run_task(1).expect_err("no device is left");
+    assert_eq!(error.exit_code(), 1);
+    let text = error.to_string();
+    assert!(text.contains("on the GPU") && text.contains("--resume continues"), "{text}");
+    drop(session);
+    let report = run_with(&config, &options);
+    assert!(report.bricks.resumed > 0, "what was finished is kept");
+    assert_same_outputs("resumed after a loss", cpu.path(), twice.path());
 }
