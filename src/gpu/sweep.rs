@@ -239,10 +239,10 @@ mod tests {
             for line in 0..p.size[0] * p.size[1] {
                 let mut at = [line / p.size[1], line % p.size[1]].map(|v| v as i32);
                 for i in 0..p.planes {
-                    for k in 0..2 {
+                    for (k, (at, size)) in at.iter_mut().zip(p.size).enumerate() {
                         let by = if i > 0 { shift(k, i) - shift(k, i - 1) } else { 0 };
                         assert!(by.abs() <= 1);
-                        at[k] = (at[k] + by).rem_euclid(p.size[k] as i32);
+                        *at = (*at + by).rem_euclid(size as i32);
                     }
                     met[((i * p.size[0] + at[0] as u32) * p.size[1] + at[1] as u32) as usize] += 1;
                 }

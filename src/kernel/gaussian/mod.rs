@@ -138,6 +138,7 @@ struct Table<'a> {
 
 impl Table<'_> {
     /// Taps about position `p` of an axis of `n`; `place` tells where a position's row stands.
+    #[allow(clippy::needless_range_loop)] // k is a distance as well as an index
     fn taps(&mut self, axis: usize, p: usize, n: usize, place: impl Fn(usize) -> usize) -> Taps<'_> {
         let bell = &*self.bells[axis];
         let radius = bell.len() - 1;
