@@ -44,6 +44,17 @@ op = "obscurance"
 input = "vol"
 directions = 12
 max_distance = 9
+[stage.paint]
+op = "transfer"
+input = "vol"
+points = [[0, 0, 1, 0, 0], [65535, 1, 0, 0, 1]]
+[stage.coloured]
+op = "obscurance"
+input = "vol"
+directions = 12
+max_distance = 5
+colour = "paint"
+weight_by_normal = true
 [stage.masked]
 op = "ambient_occlusion"
 input = "vol"
@@ -107,12 +118,16 @@ from = "edge"
 dtype = "u8"
 range = "auto"
 chunk = 16
+[output.coloured]
+path = "out/coloured.npy"
+from = "coloured"
+dtype = "f32"
 [output.light]
 path = "out/light.raw"
 from = "light"
 "#;
 
-const OUTPUTS: [&str; 10] = [
+const OUTPUTS: [&str; 11] = [
     "stats.zarr",
     "extremes.zarr",
     "ao.zarr",
@@ -122,6 +137,7 @@ const OUTPUTS: [&str; 10] = [
     "map.zarr",
     "masked.zarr",
     "edge.zarr",
+    "coloured.npy",
     "light.raw",
 ];
 
@@ -145,6 +161,14 @@ fn volume() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     write_npy(&dir.path().join("vol.npy"), "<u2", SHAPE, &u16_bytes(&mixed_u16(SHAPE)));
     dir
+}
+
+#[test]
+fn openness_has_one_component_whatever_shapes_it() {
+    let dir = volume();
+    run(dir.path(), CONFIG, &[]);
+    let (decoded, _) = one(&dir.path().join("out/coloured.npy"));
+    assert!(decoded.values().all(|(shape, _)| *shape == SHAPE), "{:?}", decoded.values().next().map(|d| &d.0));
 }
 
 #[test]

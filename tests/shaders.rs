@@ -5,6 +5,7 @@ use std::path::Path;
 
 use naga::front::wgsl;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
+use occlude::gpu::record::Shader;
 
 /// What is wrong with a shader, and the names of its entry points.
 fn check(text: &str) -> Result<Vec<String>, String> {
@@ -17,27 +18,31 @@ fn check(text: &str) -> Result<Vec<String>, String> {
 #[test]
 fn every_shader_is_valid() {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders");
-    let mut found = 0;
+    let mut files: Vec<String> = fs::read_dir(&dir)
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .filter(|n| n.ends_with(".wgsl"))
+        .collect();
     let mut failures = String::new();
-    for entry in fs::read_dir(&dir).unwrap() {
-        let path = entry.unwrap().path();
-        if path.extension().is_none_or(|e| e != "wgsl") {
-            continue;
+    for shader in Shader::ALL {
+        let name = shader.name();
+        files.retain(|f| *f != format!("{name}.wgsl"));
+        match check(shader.text()) {
+            Ok(names) if names == shader.entries() => {}
+            Ok(names) => failures += &format!("{name}: entry points {names:?}\n"),
+            Err(e) => failures += &format!("{name}: {e}\n"),
         }
-        found += 1;
-        let text = fs::read_to_string(&path).unwrap();
-        match check(&text) {
-            Ok(names) if names == ["first", "next"] => {}
-            Ok(names) => failures += &format!("{}: entry points {names:?}\n", path.display()),
-            Err(e) => failures += &format!("{}: {e}\n", path.display()),
+        let storage = shader.text().matches("var<storage").count();
+        if storage != shader.bindings() {
+            failures += &format!("{name}: {storage} storage bindings\n");
         }
         for word in ["Bindings", "Workgroup", "Agrees"] {
-            if !text.contains(word) {
-                failures += &format!("{}: the head does not state: {word}\n", path.display());
+            if !shader.text().contains(word) {
+                failures += &format!("{name}: the head does not state: {word}\n");
             }
         }
     }
-    assert!(found > 0, "no shader in {}", dir.display());
+    assert!(files.is_empty(), "no pipeline is made of {files:?}");
     assert!(failures.is_empty(), "{failures}");
 }
 

@@ -3,27 +3,28 @@
 use std::sync::{Arc, Condvar, Mutex};
 
 use super::facts::{GpuFacts, GpuKind, SLOTS};
-use super::passes::Quantity;
+use super::record::Shader;
 use super::slot::Slot;
 
 /// An open device with its pipelines and slots. Dropped and opened anew after a failure.
 pub struct Device {
     pub device: wgpu::Device,
     pub queue: wgpu::Queue,
-    pub layout: wgpu::BindGroupLayout,
-    /// By [`pipeline_index`].
-    pipelines: Vec<wgpu::ComputePipeline>,
+    /// By shader, in the order of [`Shader::ALL`].
+    kernels: Vec<Kernel>,
+    /// Nanoseconds of a tick of the time stamps, where they were asked for and there are any.
+    pub tick: Option<f64>,
     slots: Mutex<Vec<Slot>>,
     idle: Condvar,
     /// What the driver reported outside of any call's error scopes, and the loss of the device.
     pub fault: Arc<Mutex<Option<String>>>,
 }
 
-const SHADERS: [(&str, &str); 3] = [
-    ("window_extremes", include_str!("../../shaders/window_extremes.wgsl")),
-    ("window_sums32", include_str!("../../shaders/window_sums32.wgsl")),
-    ("window_sums64", include_str!("../../shaders/window_sums64.wgsl")),
-];
+/// A shader's layout of bindings, and a pipeline for each of its entry points.
+pub struct Kernel {
+    pub layout: wgpu::BindGroupLayout,
+    pub pipelines: Vec<wgpu::ComputePipeline>,
+}
 
 /// Preference; software comes in only when asked for.
 fn rank(kind: wgpu::DeviceType) -> u32 {
@@ -61,9 +62,11 @@ fn adapter(kind: GpuKind) -> Result<wgpu::Adapter, String> {
     })
 }
 
-/// Opens a device of this kind.
-pub fn open(kind: GpuKind) -> Result<(Device, GpuFacts), String> {
+/// Opens a device of this kind; `timed` asks for time stamps, which it may not have.
+pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
     let adapter = adapter(kind)?;
+    let stamps = wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::TIMESTAMP_QUERY_INSIDE_ENCODERS;
+    let timed = timed && adapter.features().contains(stamps);
     let info = adapter.get_info();
     let limits = adapter.limits();
     let wanted = wgpu::Limits {
@@ -73,7 +76,7 @@ pub fn open(kind: GpuKind) -> Result<(Device, GpuFacts), String> {
     };
     let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
         label: Some("occlude"),
-        required_features: wgpu::Features::empty(),
+        required_features: if timed { stamps } else { wgpu::Features::empty() },
         required_limits: wanted,
         experimental_features: wgpu::ExperimentalFeatures::disabled(),
         memory_hints: wgpu::MemoryHints::MemoryUsage,
@@ -94,66 +97,69 @@ pub fn open(kind: GpuKind) -> Result<(Device, GpuFacts), String> {
         name: info.name.clone(),
         software: info.device_type == wgpu::DeviceType::Cpu,
         most_bytes: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(1 << 30),
+        exact_floats: false, // until the probe has said so
     };
-    let (layout, pipelines) = pipelines(&device)?;
+    let tick = timed.then(|| queue.get_timestamp_period() as f64);
+    let kernels = kernels(&device)?;
     let slots = (0..SLOTS).map(|_| Slot::default()).collect();
     let (slots, idle) = (Mutex::new(slots), Condvar::new());
-    Ok((Device { device, queue, layout, pipelines, slots, idle, fault }, facts))
+    Ok((Device { device, queue, kernels, tick, slots, idle, fault }, facts))
 }
 
-fn pipelines(device: &wgpu::Device) -> Result<(wgpu::BindGroupLayout, Vec<wgpu::ComputePipeline>), String> {
+fn kernels(device: &wgpu::Device) -> Result<Vec<Kernel>, String> {
     let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
+    let kernels = Shader::ALL.iter().map(|s| kernel(device, *s)).collect();
+    match pollster::block_on(scope.pop()) {
+        Some(error) => Err(format!("a shader was refused: {error}")),
+        None => Ok(kernels),
+    }
+}
+
+fn kernel(device: &wgpu::Device, shader: Shader) -> Kernel {
+    let name = shader.name();
     let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
         binding,
         visibility: wgpu::ShaderStages::COMPUTE,
         ty: wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None },
         count: None,
     };
-    let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-        label: Some("pass"),
-        entries: &[
-            entry(0, wgpu::BufferBindingType::Uniform),
-            entry(1, wgpu::BufferBindingType::Storage { read_only: true }),
-            entry(2, wgpu::BufferBindingType::Storage { read_only: false }),
-        ],
-    });
+    let storage = |k: u32| entry(k, wgpu::BufferBindingType::Storage { read_only: k % 2 == 1 });
+    let mut entries = vec![entry(0, wgpu::BufferBindingType::Uniform)];
+    entries.extend((1..=shader.bindings() as u32).map(storage));
+    let desc = wgpu::BindGroupLayoutDescriptor { label: Some(name), entries: &entries };
+    let layout = device.create_bind_group_layout(&desc);
     let shared = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: Some("pass"),
+        label: Some(name),
         bind_group_layouts: &[Some(&layout)],
         immediate_size: 0,
     });
-    let mut pipelines = Vec::new();
-    for (name, text) in SHADERS {
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some(name),
+        source: wgpu::ShaderSource::Wgsl(shader.text().into()),
+    });
+    let pipeline = |entry: &&str| {
+        device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(name),
-            source: wgpu::ShaderSource::Wgsl(text.into()),
-        });
-        for entry in ["first", "next"] {
-            pipelines.push(device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-                label: Some(name),
-                layout: Some(&shared),
-                module: &module,
-                entry_point: Some(entry),
-                compilation_options: wgpu::PipelineCompilationOptions::default(),
-                cache: None,
-            }));
-        }
-    }
-    match pollster::block_on(scope.pop()) {
-        Some(error) => Err(format!("a shader was refused: {error}")),
-        None => Ok((layout, pipelines)),
-    }
+            layout: Some(&shared),
+            module: &module,
+            entry_point: Some(entry),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            cache: None,
+        })
+    };
+    let pipelines = shader.entries().iter().map(pipeline).collect();
+    Kernel { layout, pipelines }
 }
 
 impl Device {
-    /// The pipeline of pass `axis` of a quantity.
-    pub fn pipeline(&self, quantity: Quantity, axis: usize) -> &wgpu::ComputePipeline {
-        let shader = match quantity {
-            Quantity::Extremes => 0,
-            Quantity::Sum { wide: false, .. } => 1,
-            Quantity::Sum { wide: true, .. } => 2,
-        };
-        &self.pipelines[2 * shader + (axis > 0) as usize]
+    pub fn kernel(&self, shader: Shader) -> &Kernel {
+        let place = Shader::ALL.iter().position(|s| *s == shader).expect("ALL holds every shader");
+        &self.kernels[place]
+    }
+
+    /// Whether a call would have to wait for a slot.
+    pub fn is_busy(&self) -> bool {
+        self.slots.lock().unwrap_or_else(|e| e.into_inner()).is_empty()
     }
 
     /// Waits for a free slot.

@@ -1,17 +1,13 @@
-//! Window kernels on the device: pack and upload, three passes per quantity, read back, finish with the CPU's rows.
+//! Runs recordings on the device: map, fill, submit, map, finish; opens a lost device anew and tries once more.
 
 use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 use super::device::{self, Device, SlotGuard};
-use super::facts::{self, GpuFacts, GpuKind};
-use super::passes::{Job, PASS_STRIDE, Part, Quantity, Sizes, groups};
-use crate::grid::{AnyView, View, Voxel};
-use crate::kernel::Context;
-use crate::kernel::window::finish::{Sums, Windows, finish};
-use crate::kernel::window::{self, Needs, WindowOut};
-use crate::stage::WindowParams;
+use super::facts::{GpuFacts, GpuKind};
+use super::record::{Command, Dispatch, PARAMS_STRIDE, Recording, STAMP_BYTES, groups};
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
 /// stays silent for longer is taken for lost.
@@ -34,27 +30,49 @@ impl std::error::Error for GpuError {}
 pub struct Times {
     /// Making and mapping buffers, packing voxels into them.
     pub pack: f64,
-    /// From submission until the results are mapped: copy to the device, passes, copy back, and the other slot's work.
+    /// From submission until the results are mapped: copy to the device, passes, copy back, and the other slots' work.
     pub device: f64,
     /// From mapped sums to results, on the CPU.
     pub finish: f64,
+    /// By the device's own clock: the copy there, the passes, the copy back. 0 without time stamps.
+    pub stamps: [f64; 3],
 }
 
-/// A GPU that runs window kernels for any number of threads.
+/// A GPU that runs kernels for any number of threads.
 pub struct Gpu {
     kind: GpuKind,
     facts: GpuFacts,
+    timed: bool,
     /// Most bytes of one buffer; larger calls are cut.
     cap: u64,
     device: Mutex<Option<Arc<Device>>>,
+    /// No device can be opened any more (set by tests).
+    gone: AtomicBool,
 }
+
+/// Writes voxels into the mapped upload buffer, behind parameters and tables; false where the device has nothing to do.
+pub type Fill<'a> = &'a mut dyn FnMut(&mut wgpu::WriteOnly<[u8]>) -> bool;
+/// Takes the results; `None` where the device had nothing to do.
+pub type Finish<'a> = &'a mut dyn FnMut(Option<&[u8]>) -> Result<(), GpuError>;
 
 impl Gpu {
     /// Opens the best Vulkan adapter of this kind; the error says what was looked for and found.
     pub fn open(kind: GpuKind) -> Result<Gpu, String> {
-        let (device, facts) = device::open(kind)?;
+        Gpu::open_with(kind, false)
+    }
+
+    /// As [`Gpu::open`], with time stamps where the adapter has them.
+    pub fn open_timed(kind: GpuKind) -> Result<Gpu, String> {
+        Gpu::open_with(kind, true)
+    }
+
+    fn open_with(kind: GpuKind, timed: bool) -> Result<Gpu, String> {
+        let (device, facts) = device::open(kind, timed)?;
         let cap = facts.most_bytes;
-        Ok(Gpu { kind, facts, cap, device: Mutex::new(Some(Arc::new(device))) })
+        let mut gpu =
+            Gpu { kind, facts, timed, cap, device: Mutex::new(Some(Arc::new(device))), gone: AtomicBool::new(false) };
+        gpu.facts.exact_floats = gpu.probe().map_err(|e| format!("{} does not compute: {e}", gpu.facts.name))?;
+        Ok(gpu)
     }
 
     pub fn facts(&self) -> &GpuFacts {
@@ -66,52 +84,30 @@ impl Gpu {
         self.cap = bytes.min(self.facts.most_bytes);
     }
 
-    /// The same as [`window::window`], bit for bit, for inputs that [`super::facts::window`] admits. Windows too large for
-    /// the device even one voxel at a time are computed by the CPU kernel. After a failure the device is opened anew and
-    /// the call tried once more.
-    ///
-    /// Panics where [`window::window`] does.
+    pub(super) fn cap(&self) -> u64 {
+        self.cap
+    }
+
+    /// Whether a call would have to wait for others to leave a slot.
+    pub fn is_busy(&self) -> bool {
+        let held = self.device.lock().unwrap_or_else(|e| e.into_inner()).clone();
+        held.is_some_and(|d| d.is_busy())
+    }
+
+    /// Runs `call` on the device; after a failure once more, on a device opened anew.
     ///
     /// # Errors
-    /// An input without a kernel, or a second failure of the device.
-    pub fn window(
-        &self,
-        src: AnyView,
-        params: &WindowParams,
-        at: [usize; 3],
-        outs: &mut [WindowOut],
-        cx: &mut Context,
-    ) -> Result<Times, GpuError> {
-        let channels: Vec<_> = outs.iter().map(|o| o.channel).collect();
-        facts::window(src.dtype(), params.missing.is_some(), &channels).map_err(|e| GpuError(e.into()))?;
-        let Some(dst) = outs.first().map(|o| o.dst.shape()) else { return Ok(Times::default()) };
-        assert!((0..3).all(|a| at[a] + dst[a] <= src.shape()[a]), "output {dst:?} at {at:?} sticks out");
-        if dst.contains(&0) {
-            return Ok(Times::default());
-        }
-        let needs = Needs::of(channels.into_iter(), false);
-        let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs);
-        let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap)?))) else {
-            window::window(src, params, window::Place::whole(at), outs, cx); // integers are exact
-            return Ok(Times::default());
-        };
-        let run = |outs: &mut [WindowOut], cx: &mut Context| {
+    /// A second failure.
+    pub(super) fn attempt<T>(&self, mut call: impl FnMut(&Device) -> Result<T, GpuError>) -> Result<T, GpuError> {
+        let mut once = || {
             let device = self.device()?;
-            let mut times = Times::default();
-            for part in &parts {
-                let result = run_part(&device, &job, part, src, params, outs, &mut times, cx);
-                if let Err(error) = result {
-                    self.forget(&device);
-                    return Err(error);
-                }
-            }
-            Ok(times)
+            call(&device).inspect_err(|_| self.forget(&device))
         };
-        let first = match run(outs, cx) {
-            Ok(times) => return Ok(times),
+        let first = match once() {
+            Ok(done) => return Ok(done),
             Err(error) => error,
         };
-        run(outs, cx).map_err(|e| {
+        once().map_err(|e| {
             GpuError(format!("{}: {e}; before that, on the device as first opened: {first}", self.facts.name))
         })
     }
@@ -122,7 +118,11 @@ impl Gpu {
         if let Some(device) = &*held {
             return Ok(device.clone());
         }
-        let (device, _) = device::open(self.kind).map_err(|e| GpuError(format!("the device was lost; {e}")))?;
+        if self.gone.load(Ordering::Relaxed) {
+            return Err(GpuError("the device was lost, and no other is there".into()));
+        }
+        let opened = device::open(self.kind, self.timed);
+        let (device, _) = opened.map_err(|e| GpuError(format!("the device was lost; {e}")))?;
         Ok(held.insert(Arc::new(device)).clone())
     }
 
@@ -134,9 +134,10 @@ impl Gpu {
         }
     }
 
-    /// Destroys the device under the lane, as a driver reset would. For tests.
+    /// Destroys the device under the lane, as a driver reset would, so that it can be opened anew or not. For tests.
     #[doc(hidden)]
-    pub fn lose(&self) {
+    pub fn lose(&self, for_good: bool) {
+        self.gone.store(for_good, Ordering::Relaxed);
         if let Some(device) = &*self.device.lock().unwrap_or_else(|e| e.into_inner()) {
             device.device.destroy();
         }
@@ -144,21 +145,18 @@ impl Gpu {
 }
 
 /// One part from voxels to results.
-#[allow(clippy::too_many_arguments)]
-fn run_part(
+pub fn run_part(
     device: &Device,
-    job: &Job,
-    part: &Part,
-    src: AnyView,
-    params: &WindowParams,
-    outs: &mut [WindowOut],
+    recording: &Recording,
+    fill: Fill,
+    finish: Finish,
     times: &mut Times,
-    cx: &mut Context,
 ) -> Result<(), GpuError> {
+    debug_assert_eq!(recording.fault(), None);
     let mut held = device.take_slot();
     let scopes = [wgpu::ErrorFilter::Internal, wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Validation]
         .map(|f| device.device.push_error_scope(f));
-    let result = on_device(device, &mut held, job, part, src, params, outs, times, cx);
+    let result = on_device(device, &mut held, recording, fill, finish, times);
     // The innermost first. What a scope caught explains what failed after it.
     let mut caught = None;
     for scope in scopes.into_iter().rev() {
@@ -177,37 +175,42 @@ fn run_part(
     Err(error)
 }
 
-#[allow(clippy::too_many_arguments)]
 fn on_device(
     device: &Device,
     held: &mut SlotGuard,
-    job: &Job,
-    part: &Part,
-    src: AnyView,
-    params: &WindowParams,
-    outs: &mut [WindowOut],
+    recording: &Recording,
+    fill: Fill,
+    finish: Finish,
     times: &mut Times,
-    cx: &mut Context,
 ) -> Result<(), GpuError> {
-    let (sizes, quantities) = (job.sizes(part), job.quantities());
+    let sizes = recording.sizes;
     let slot = &mut held.slot;
     slot.grow(&device.device, sizes);
     let start = Instant::now();
     map(device, slot.upload.get(), wgpu::MapMode::Write, sizes.upload(), None)?;
-    fill(slot.upload.get(), job, part, &quantities, src, sizes)?;
+    let work = write(slot.upload.get(), recording, fill)?;
     slot.upload.get().unmap();
     times.pack += start.elapsed().as_secs_f64();
+    if !work {
+        return finish(None);
+    }
     let start = Instant::now();
-    let index = submit(device, held, job, part, &quantities, sizes);
+    let index = submit(device, held, recording);
     let read = held.slot.read.get();
-    map(device, read, wgpu::MapMode::Read, sizes.read, Some(index))?;
+    let bytes = sizes.read + STAMP_BYTES;
+    map(device, read, wgpu::MapMode::Read, bytes, Some(index))?;
     times.device += start.elapsed().as_secs_f64();
     let start = Instant::now();
     {
-        let bytes =
-            read.get_mapped_range(0..sizes.read).map_err(|e| GpuError(format!("cannot read results: {e:?}")))?;
-        let windows = windows(&bytes, part, &quantities)?;
-        finish(src, params, job.at, outs, &windows, cx);
+        let bytes = read.get_mapped_range(0..bytes).map_err(|e| GpuError(format!("cannot read results: {e:?}")))?;
+        let (results, stamps) = bytes.split_at(sizes.read as usize);
+        finish(Some(results))?;
+        if let Some(tick) = device.tick {
+            let stamps: &[u64] = bytemuck::try_cast_slice(&stamps[..32]).unwrap_or(&[0; 4]);
+            for (sum, pair) in times.stamps.iter_mut().zip(stamps.windows(2)) {
+                *sum += pair[1].saturating_sub(pair[0]) as f64 * tick * 1e-9;
+            }
+        }
     }
     read.unmap();
     times.finish += start.elapsed().as_secs_f64();
@@ -246,116 +249,103 @@ fn map(
     }
 }
 
-/// Writes the parameters of the passes and the packed voxels of a part into the mapped upload buffer.
-fn fill(
-    buffer: &wgpu::Buffer,
-    job: &Job,
-    part: &Part,
-    quantities: &[Quantity],
-    src: AnyView,
-    sizes: Sizes,
-) -> Result<(), GpuError> {
+/// Writes parameters, tables and voxels into the mapped upload buffer; false where there is no work.
+fn write(buffer: &wgpu::Buffer, recording: &Recording, fill: Fill) -> Result<bool, GpuError> {
+    let sizes = recording.sizes;
     let view = buffer.get_mapped_range_mut(0..sizes.upload());
     let mut view = view.map_err(|e| GpuError(format!("cannot write voxels: {e:?}")))?;
-    for (k, pass) in quantities.iter().flat_map(|q| job.passes(part, *q)).enumerate() {
-        let bytes = bytemuck::bytes_of(&pass);
-        let from = k * PASS_STRIDE as usize;
-        view.slice(from..from + bytes.len()).copy_from_slice(bytes);
+    for (k, dispatch) in recording.dispatches().enumerate() {
+        let from = k * PARAMS_STRIDE as usize;
+        view.slice(from..from + dispatch.params.len()).copy_from_slice(&dispatch.params);
     }
-    let from = sizes.upload() as usize - sizes.source as usize;
-    let pitch = job.pitch(part) * job.voxel;
-    let mut rows = view.slice(from..from + pitch * part.src[0] * part.src[1]);
-    fn write<T: Voxel + bytemuck::Pod>(v: View<T>, part: &Part, pitch: usize, out: &mut wgpu::WriteOnly<[u8]>) {
-        let v = v.part(part.from, part.src);
-        for z in 0..part.src[0] {
-            for y in 0..part.src[1] {
-                let bytes: &[u8] = bytemuck::cast_slice(v.row_at(z, y));
-                let from = (z * part.src[1] + y) * pitch;
-                // The padding at the end of a row is never read by a shader.
-                out.slice(from..from + bytes.len()).copy_from_slice(bytes);
-            }
-        }
-    }
-    match src {
-        AnyView::U8(v) => write(v, part, pitch, &mut rows),
-        AnyView::I8(v) => write(v, part, pitch, &mut rows),
-        AnyView::U16(v) => write(v, part, pitch, &mut rows),
-        AnyView::I16(v) => write(v, part, pitch, &mut rows),
-        other => return Err(GpuError(format!("no GPU kernel for {}", other.dtype()))),
-    }
-    Ok(())
+    let tables: &[u8] = bytemuck::cast_slice(&recording.tables);
+    let from = sizes.params as usize;
+    view.slice(from..from + tables.len()).copy_from_slice(tables);
+    let from = (sizes.params + sizes.tables) as usize;
+    Ok(fill(&mut view.slice(from..from + sizes.source as usize)))
 }
 
 /// Encodes and submits the copies and passes of a part.
-fn submit(
-    device: &Device,
-    held: &SlotGuard,
-    job: &Job,
-    part: &Part,
-    quantities: &[Quantity],
-    sizes: Sizes,
-) -> wgpu::SubmissionIndex {
-    let slot = &held.slot;
-    let (source, a, b) = (slot.source.get(), slot.a.get(), slot.b.get());
-    let params_bytes = sizes.upload() - sizes.source;
+fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::SubmissionIndex {
+    let (slot, sizes) = (&held.slot, recording.sizes);
+    let stamps = device.tick.map(|_| {
+        device.device.create_query_set(&wgpu::QuerySetDescriptor {
+            label: None,
+            ty: wgpu::QueryType::Timestamp,
+            count: 4,
+        })
+    });
     let mut encoder = device.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("part") });
-    encoder.copy_buffer_to_buffer(slot.upload.get(), 0, slot.params.get(), 0, params_bytes);
-    encoder.copy_buffer_to_buffer(slot.upload.get(), params_bytes, source, 0, sizes.source);
-    let (mut number, mut place) = (0, 0);
-    for &quantity in quantities {
-        for (axis, pass) in job.passes(part, quantity).into_iter().enumerate() {
-            let (input, output) = [(source, a), (a, b), (b, a)][axis];
-            let offset = number * PASS_STRIDE;
-            let params = wgpu::BufferBinding {
-                buffer: slot.params.get(),
-                offset,
-                size: wgpu::BufferSize::new(size_of_val(&pass) as u64),
-            };
-            let bind = device.device.create_bind_group(&wgpu::BindGroupDescriptor {
-                label: None,
-                layout: &device.layout,
-                entries: &[
-                    wgpu::BindGroupEntry { binding: 0, resource: wgpu::BindingResource::Buffer(params) },
-                    wgpu::BindGroupEntry { binding: 1, resource: input.as_entire_binding() },
-                    wgpu::BindGroupEntry { binding: 2, resource: output.as_entire_binding() },
-                ],
-            });
-            let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            compute.set_pipeline(device.pipeline(quantity, axis));
-            compute.set_bind_group(0, &bind, &[]);
-            let [x, y] = groups(&pass);
-            compute.dispatch_workgroups(x, y, 1);
-            number += 1;
+    let stamp = |encoder: &mut wgpu::CommandEncoder, k: u32| {
+        stamps.iter().for_each(|s| encoder.write_timestamp(s, k));
+    };
+    stamp(&mut encoder, 0);
+    let mut from = 0;
+    for (to, bytes) in [(&slot.params, sizes.params), (&slot.tables, sizes.tables), (&slot.source, sizes.source)] {
+        if bytes > 0 {
+            encoder.copy_buffer_to_buffer(slot.upload.get(), from, to.get(), 0, bytes);
         }
-        let bytes = result_bytes(part, quantity);
-        encoder.copy_buffer_to_buffer(a, 0, slot.read.get(), place, bytes);
-        place += bytes.next_multiple_of(256);
+        from += bytes;
+    }
+    stamp(&mut encoder, 1);
+    let mut number = 0;
+    let last = recording.commands.iter().rposition(|c| matches!(c, Command::Dispatch(_)));
+    let (compute, back) = recording.commands.split_at(last.map_or(0, |l| l + 1));
+    encode(device, held, compute, &mut number, &mut encoder);
+    stamp(&mut encoder, 2);
+    encode(device, held, back, &mut number, &mut encoder);
+    stamp(&mut encoder, 3);
+    if let Some(set) = &stamps {
+        let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
+        let desc = wgpu::BufferDescriptor { label: Some("stamps"), size: 32, usage, mapped_at_creation: false };
+        let resolved = device.device.create_buffer(&desc);
+        encoder.resolve_query_set(set, 0..4, &resolved, 0);
+        encoder.copy_buffer_to_buffer(&resolved, 0, slot.read.get(), sizes.read, 32);
     }
     device.queue.submit([encoder.finish()])
 }
 
-fn result_bytes(part: &Part, quantity: Quantity) -> u64 {
-    part.dst.iter().map(|&n| n as u64).product::<u64>() * quantity.bytes()
-}
-
-/// The mapped results of a part by quantity.
-fn windows<'a>(bytes: &'a [u8], part: &Part, quantities: &[Quantity]) -> Result<Windows<'a>, GpuError> {
-    fn cast<T: bytemuck::Pod>(bytes: &[u8]) -> Result<&[T], GpuError> {
-        bytemuck::try_cast_slice(bytes).map_err(|e| GpuError(format!("results are not aligned: {e}")))
-    }
-    let mut out = Windows { lo: part.lo, shape: part.dst, extremes: &[], s1: Sums::None, s2: Sums::None };
-    let mut place = 0;
-    for &quantity in quantities {
-        let len = result_bytes(part, quantity) as usize;
-        let slice = &bytes[place..place + len];
-        match quantity {
-            Quantity::Extremes => out.extremes = cast(slice)?,
-            Quantity::Sum { square, wide } => {
-                let sums = if wide { Sums::Wide(cast(slice)?) } else { Sums::Narrow(cast(slice)?) };
-                *(if square { &mut out.s2 } else { &mut out.s1 }) = sums;
+/// Commands in their order; dispatches in a row share a pass. `number` counts dispatches: their place among parameters.
+fn encode(
+    device: &Device,
+    held: &SlotGuard,
+    commands: &[Command],
+    number: &mut u64,
+    encoder: &mut wgpu::CommandEncoder,
+) {
+    let slot = &held.slot;
+    for run in commands.chunk_by(|a, b| matches!((a, b), (Command::Dispatch(_), Command::Dispatch(_)))) {
+        match &run[0] {
+            Command::Readback(r) => {
+                encoder.copy_buffer_to_buffer(slot.of(r.from), 0, slot.read.get(), r.to, r.bytes);
+            }
+            Command::Dispatch(_) => {
+                let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                for command in run {
+                    let Command::Dispatch(d) = command else { continue };
+                    dispatch(device, held, d, *number * PARAMS_STRIDE, &mut pass);
+                    *number += 1;
+                }
             }
         }
-        place += len.next_multiple_of(256);
     }
-    Ok(out)
+}
+
+fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, pass: &mut wgpu::ComputePass) {
+    let kernel = device.kernel(d.shader);
+    let size = wgpu::BufferSize::new(d.params.len() as u64);
+    let params = wgpu::BufferBinding { buffer: held.slot.params.get(), offset, size };
+    let mut entries = vec![wgpu::BindGroupEntry { binding: 0, resource: wgpu::BindingResource::Buffer(params) }];
+    entries.extend(
+        d.bind
+            .iter()
+            .zip(1..)
+            .map(|(b, binding)| wgpu::BindGroupEntry { binding, resource: held.slot.of(*b).as_entire_binding() }),
+    );
+    let desc = wgpu::BindGroupDescriptor { label: None, layout: &kernel.layout, entries: &entries };
+    let bind = device.device.create_bind_group(&desc);
+    pass.set_pipeline(&kernel.pipelines[d.entry]);
+    pass.set_bind_group(0, &bind, &[]);
+    let [x, y] = groups(d.threads);
+    pass.dispatch_workgroups(x, y, 1);
 }

@@ -20,6 +20,8 @@ pub struct GpuFacts {
     pub software: bool,
     /// Most bytes of one buffer that a shader can see.
     pub most_bytes: u64,
+    /// f32 arithmetic is the CPU's, bit for bit, where shaders ask for it.
+    pub exact_floats: bool,
 }
 
 /// Why exact openness stays on the CPU.
@@ -28,14 +30,14 @@ pub const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
 /// Why the beta distribution stays on the CPU.
 pub const BETA: &str = "no GPU kernel for method \"beta\": runs on the CPU";
 
-/// Bricks that are on the GPU at once: one computes while the host copies for the other.
-pub const SLOTS: u64 = 2;
+/// Bricks that are on the GPU's way at once: one is packed, one computes, one is read back and finished.
+pub const SLOTS: u64 = 3;
 
 impl GpuFacts {
     /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to seven buffers' worth
     /// per slot) and a dispatch stays short. Larger boxes are cut.
     pub fn buffer_cap(&self, memory: u64) -> u64 {
-        self.most_bytes.min((memory / 32).clamp(256 << 10, 256 << 20))
+        self.most_bytes.min((memory / 48).clamp(256 << 10, 256 << 20))
     }
 }
 
@@ -55,6 +57,39 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
         DType::U32 | DType::I32 => Err("no GPU kernel that sums 32-bit integers exactly: runs on the CPU"),
         DType::F32 => Err("no GPU kernel that holds SPEC 5.6 for f32: runs on the CPU"),
         DType::F64 => Err("no GPU kernel that holds SPEC 5.6 for f64: runs on the CPU"),
+    }
+}
+
+/// Why float stages stay on the CPU where an adapter rounds otherwise.
+pub const INEXACT: &str = "the adapter rounds or fuses f32 operations unlike the CPU: runs on the CPU";
+
+/// Whether a Gaussian of this type has a GPU kernel, or why not. It also asks for [`GpuFacts::exact_floats`].
+pub fn gaussian(dtype: DType, missing: bool, variance: bool) -> Result<(), &'static str> {
+    match dtype {
+        _ if variance => Err("no GPU kernel for a Gaussian variance, which takes f64: runs on the CPU"),
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
+            Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
+        }
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 => Ok(()),
+        // NaN, infinities and subnormals, which drivers treat as they like.
+        DType::F32 => {
+            Err("no GPU kernel for a Gaussian of f32, whose NaN and subnormals drivers treat freely: runs on the CPU")
+        }
+        DType::U32 | DType::I32 | DType::F64 => Err("no GPU kernel for a Gaussian in f64: runs on the CPU"),
+    }
+}
+
+/// Why gradients stay on the CPU.
+pub const GRADIENT: &str =
+    "no GPU kernel for gradients, which the CPU sums in f64 faster than results come back: runs on the CPU";
+
+/// Whether obscurance of this type has a GPU kernel, or why not. `plain`: openness alone, with weights that depend on the
+/// direction only.
+pub fn obscurance(dtype: DType, plain: bool) -> Result<(), &'static str> {
+    match dtype {
+        _ if !plain => Err("no GPU kernel for colour bleeding and weight_by_normal: runs on the CPU"),
+        DType::F64 => Err("no GPU kernel that orders f64: runs on the CPU"),
+        _ => Ok(()),
     }
 }
 

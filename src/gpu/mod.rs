@@ -1,14 +1,28 @@
-//! The GPU lane: exact integer window sums and extremes through wgpu, finished by the CPU kernel's own row functions, so
-//! that a GPU's results equal the CPU's bit for bit.
+//! The GPU lane through wgpu. Window sums and extremes of small integers and obscurance are exact integers, finished by the
+//! CPU kernels' own row functions, so that a GPU's results equal the CPU's bit for bit.
 //!
-//! [`facts`] and [`passes`] know no wgpu: the planner uses them. [`device`] finds an adapter and opens it, [`slot`] holds
-//! the buffers of one brick at a time, [`engine`] runs windows and survives a lost device once.
+//! | file | holds |
+//! |---|---|
+//! | `facts` | what the planner knows of an adapter; which stages have kernels |
+//! | `record` | the device's work as data: buffers, dispatches, what comes back |
+//! | `passes`, `sweep`, `taps` | windows, obscurance and Gaussians recorded, cut into parts that fit |
+//! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
+//! | `engine` | runs recordings, survives a lost device once |
+//! | `windows`, `obscurance`, `gaussian` | calls like the CPU kernels' |
+//!
+//! Everything above `device` knows no wgpu.
 
 pub mod device;
 pub mod engine;
 pub mod facts;
+mod gaussian;
+mod obscurance;
 pub mod passes;
+pub mod record;
 mod slot;
+pub mod sweep;
+pub mod taps;
+mod windows;
 
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind};

@@ -1,15 +1,9 @@
-//! How a call is cut into parts that fit the device, how many bytes a part takes, and the three passes of each quantity.
-//! Pure arithmetic, shared by planner and engine.
+//! Windows: how a call is cut into parts that fit the device, and the three passes of each quantity. Pure arithmetic,
+//! shared by planner and engine.
 
+use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Shape};
 use crate::kernel::window::Needs;
-
-/// Bytes between the parameters of passes in their buffer (the largest alignment that an adapter may ask for).
-pub const PASS_STRIDE: u64 = 256;
-/// Most passes of a part: three axes of three quantities.
-pub const MOST_PASSES: u64 = 9;
-/// Threads of a workgroup; in every shader.
-pub const GROUP: u32 = 64;
 
 /// What one dispatch does; the shaders' `struct Pass`, which explains the fields.
 #[repr(C)]
@@ -83,39 +77,6 @@ pub struct Part {
     pub src: Shape,
 }
 
-/// Bytes of the buffers of a slot.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Sizes {
-    /// Packed voxels.
-    pub source: u64,
-    /// After z (and x again), and after y.
-    pub a: u64,
-    pub b: u64,
-    /// Everything that comes back.
-    pub read: u64,
-}
-
-impl Sizes {
-    pub fn max(self, o: Sizes) -> Sizes {
-        Sizes { source: self.source.max(o.source), a: self.a.max(o.a), b: self.b.max(o.b), read: self.read.max(o.read) }
-    }
-
-    fn largest(self) -> u64 {
-        self.source.max(self.a).max(self.b).max(self.read)
-    }
-
-    /// Bytes of the upload buffer: parameters, then voxels.
-    pub fn upload(self) -> u64 {
-        MOST_PASSES * PASS_STRIDE + self.source
-    }
-
-    /// Bytes of host memory that a slot takes: staging, and on a software adapter everything.
-    pub fn host_bytes(self, software: bool) -> u64 {
-        let device = if software { MOST_PASSES * PASS_STRIDE + self.source + self.a + self.b } else { 0 };
-        self.upload() + self.read + device
-    }
-}
-
 impl Job {
     /// `None` if voxels of this type have no kernel here, or the windows could hold 2^31 voxels.
     pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], radius: [usize; 3], needs: Needs) -> Option<Job> {
@@ -170,37 +131,21 @@ impl Job {
         let element = quantities.iter().map(|q| q.bytes()).max().unwrap_or(4);
         let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
         let ([nz, ny, nx], [mz, my, _]) = (part.src, part.dst);
-        // Multiples of 256: a slot's buffers then serve bricks that differ by a few voxels, and copies are aligned.
-        let up = |n: u64| n.next_multiple_of(256).max(256);
         Sizes {
-            source: up(product([nz, ny, self.pitch(part)]) * self.voxel as u64),
-            a: up(product([mz, ny, nx]) * element),
-            b: up(product([mz, my, nx]) * element),
-            read: quantities.iter().map(|q| up(product(part.dst) * q.bytes())).sum::<u64>().max(256),
+            params: (3 * quantities.len() as u64 * PARAMS_STRIDE).max(PARAMS_STRIDE),
+            tables: 0,
+            source: rounded(product([nz, ny, self.pitch(part)]) * self.voxel as u64),
+            a: rounded(product([mz, ny, nx]) * element),
+            b: rounded(product([mz, my, nx]) * element),
+            read: quantities.iter().map(|q| rounded(product(part.dst) * q.bytes())).sum::<u64>().max(256),
         }
     }
 
     /// Parts of which every buffer is at most `cap` bytes: halves along z first, since cuts there keep rows whole and cost
     /// least. `None` where even one voxel's windows do not fit.
     pub fn parts(&self, cap: u64) -> Option<Vec<Part>> {
-        let mut open = vec![([0; 3], self.dst)];
-        let mut parts = Vec::new();
-        while let Some((lo, shape)) = open.pop() {
-            let part = self.part(lo, shape);
-            if self.sizes(&part).largest() <= cap {
-                parts.push(part);
-                continue;
-            }
-            let axis = (0..3).find(|&a| shape[a] > 1)?;
-            let half = shape[axis] / 2;
-            let (mut low, mut high, mut middle) = (shape, shape, lo);
-            low[axis] = half;
-            high[axis] -= half;
-            middle[axis] += half;
-            open.push((middle, high));
-            open.push((lo, low));
-        }
-        Some(parts)
+        let boxes = cut(self.dst, |lo, shape| self.sizes(&self.part(lo, shape)).largest() <= cap)?;
+        Some(boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect())
     }
 
     /// Largest buffers of any part.
@@ -250,13 +195,56 @@ impl Job {
         let threads = |p: Pass, lines: u32| Pass { threads: p.blocks * p.lines * lines, ..p };
         [threads(z, ny), threads(y, mz), threads(x, mz)]
     }
+
+    /// Every quantity of a part: three passes, then what comes back, one quantity after the other.
+    pub fn record(&self, part: &Part) -> Recording {
+        let mut commands = Vec::new();
+        let mut to = 0;
+        for quantity in self.quantities() {
+            let shader = match quantity {
+                Quantity::Extremes => Shader::Extremes,
+                Quantity::Sum { wide: false, .. } => Shader::Sums32,
+                Quantity::Sum { wide: true, .. } => Shader::Sums64,
+            };
+            for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
+                use Buffer::{A, B, Source};
+                let bind = [[Source, A], [A, B], [B, A]][axis].to_vec();
+                let params = bytemuck::bytes_of(&pass).to_vec();
+                let entry = (axis > 0) as usize;
+                commands.push(Command::Dispatch(Dispatch { shader, entry, params, bind, threads: pass.threads }));
+            }
+            let bytes = result_bytes(part, quantity);
+            commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to }));
+            to += bytes.next_multiple_of(256);
+        }
+        Recording { sizes: self.sizes(part), tables: Vec::new(), commands }
+    }
 }
 
-/// Workgroups of a pass over x and y: no axis may exceed 65535.
-pub fn groups(pass: &Pass) -> [u32; 2] {
-    let all = pass.threads.div_ceil(GROUP).max(1);
-    let x = all.min(65535);
-    [x, all.div_ceil(x)]
+/// Boxes (first voxel, extent) that tile `shape` and fit: halves along z first. `None` where even one voxel does not fit.
+pub fn cut(shape: Shape, fits: impl Fn([usize; 3], Shape) -> bool) -> Option<Vec<([usize; 3], Shape)>> {
+    let mut open = vec![([0; 3], shape)];
+    let mut boxes = Vec::new();
+    while let Some((lo, shape)) = open.pop() {
+        if fits(lo, shape) {
+            boxes.push((lo, shape));
+            continue;
+        }
+        let axis = (0..3).find(|&a| shape[a] > 1)?;
+        let half = shape[axis] / 2;
+        let (mut low, mut high, mut middle) = (shape, shape, lo);
+        low[axis] = half;
+        high[axis] -= half;
+        middle[axis] += half;
+        open.push((middle, high));
+        open.push((lo, low));
+    }
+    Some(boxes)
+}
+
+/// Bytes of a quantity's results.
+pub fn result_bytes(part: &Part, quantity: Quantity) -> u64 {
+    part.dst.iter().map(|&n| n as u64).product::<u64>() * quantity.bytes()
 }
 
 #[cfg(test)]
@@ -305,10 +293,16 @@ mod tests {
     }
 
     #[test]
-    fn groups_cover_all_threads_within_the_limit() {
-        for threads in [1, 64, 65, 65535 * 64, 65535 * 64 + 1, u32::MAX - 64] {
-            let [x, y] = groups(&Pass { threads, ..Pass::default() });
-            assert!(x <= 65535 && y <= 65535 && x as u64 * y as u64 * 64 >= threads as u64);
+    fn recordings_are_sound() {
+        let job = job(DType::I16, 9);
+        for cap in [1 << 30, 60_000] {
+            for part in job.parts(cap).unwrap() {
+                let recording = job.record(&part);
+                assert_eq!(recording.fault(), None);
+                assert_eq!(recording.dispatches().count(), 9);
+                let reads = recording.commands.iter().filter(|c| matches!(c, Command::Readback(_))).count();
+                assert_eq!(reads, job.quantities().len());
+            }
         }
     }
 }

@@ -1,17 +1,18 @@
 //! The buffers of one brick on its way through the device: made once, grown when a larger brick comes, reused.
 
-use super::passes::{MOST_PASSES, PASS_STRIDE, Sizes};
+use super::record::{Buffer, STAMP_BYTES, Sizes};
 
 /// Buffers with the bytes that they hold.
 #[derive(Default)]
 pub struct Slot {
-    /// Host to device: parameters of the passes, then packed voxels.
+    /// Host to device: parameters of the dispatches, tables, packed voxels.
     pub upload: Held,
     pub params: Held,
+    pub tables: Held,
     pub source: Held,
     pub a: Held,
     pub b: Held,
-    /// Device to host.
+    /// Device to host: results, then time stamps.
     pub read: Held,
 }
 
@@ -28,7 +29,7 @@ impl Held {
     }
 
     fn grow(&mut self, device: &wgpu::Device, label: &str, bytes: u64, usage: wgpu::BufferUsages) {
-        if self.buffer.is_none() || self.bytes < bytes {
+        if bytes > 0 && (self.buffer.is_none() || self.bytes < bytes) {
             self.buffer = None; // freed first: both need not fit
             let desc = wgpu::BufferDescriptor { label: Some(label), size: bytes, usage, mapped_at_creation: false };
             self.buffer = Some(device.create_buffer(&desc));
@@ -41,13 +42,22 @@ impl Slot {
     /// Makes every buffer large enough. Failures come through the device's error scopes.
     pub fn grow(&mut self, device: &wgpu::Device, sizes: Sizes) {
         use wgpu::BufferUsages as U;
-        let params = MOST_PASSES * PASS_STRIDE;
         self.upload.grow(device, "upload", sizes.upload(), U::MAP_WRITE | U::COPY_SRC);
-        self.params.grow(device, "params", params, U::UNIFORM | U::COPY_DST);
+        self.params.grow(device, "params", sizes.params, U::UNIFORM | U::COPY_DST);
+        self.tables.grow(device, "tables", sizes.tables, U::STORAGE | U::COPY_DST);
         self.source.grow(device, "source", sizes.source, U::STORAGE | U::COPY_DST);
         self.a.grow(device, "a", sizes.a, U::STORAGE | U::COPY_SRC);
-        self.b.grow(device, "b", sizes.b, U::STORAGE);
-        self.read.grow(device, "read", sizes.read, U::MAP_READ | U::COPY_DST);
+        self.b.grow(device, "b", sizes.b, U::STORAGE | U::COPY_SRC);
+        self.read.grow(device, "read", sizes.read + STAMP_BYTES, U::MAP_READ | U::COPY_DST);
+    }
+
+    pub fn of(&self, buffer: Buffer) -> &wgpu::Buffer {
+        match buffer {
+            Buffer::Source => self.source.get(),
+            Buffer::Tables => self.tables.get(),
+            Buffer::A => self.a.get(),
+            Buffer::B => self.b.get(),
+        }
     }
 
     /// Forgets every buffer, so that the next use makes new ones (after an error a buffer may be mapped or invalid).

@@ -26,9 +26,9 @@ pub struct BrickChoice {
 
 impl BrickChoice {
     /// Worst case by formula.
-    pub fn peak(&self, threads: usize) -> u64 {
+    pub fn peak(&self, workers: usize) -> u64 {
         memory::FIXED
-            + memory::PER_THREAD * threads as u64
+            + memory::PER_THREAD * workers as u64
             + self.parked
             + self.bytes * self.in_flight as u64
             + self.cache
@@ -123,9 +123,9 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
     let mut probe = group.clone();
     probe.brick.shape = shape;
     let parked = parked_bytes(plan, &probe);
-    let fixed = memory::FIXED + memory::PER_THREAD * plan.threads as u64;
+    let fixed = memory::FIXED + memory::PER_THREAD * plan.workers as u64;
     let room = plan.memory.checked_sub(fixed + parked)?;
-    let in_flight = (room / bytes.max(1)).min(memory::in_flight(plan.threads) as u64) as usize;
+    let in_flight = (room / bytes.max(1)).min(memory::in_flight(plan.workers) as u64) as usize;
     if in_flight == 0 {
         return None;
     }
@@ -157,7 +157,7 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     // and the last one's writing.
     let rounds = ((bricks / threads).ceil() * threads + 0.5 * threads) / bricks;
     let short_rows = 1.0 + 24.0 / shape[2].min(region[2]) as f64;
-    let starved = if choice.in_flight > plan.threads { 1.0 } else { 1.5 + threads / choice.in_flight as f64 };
+    let starved = if choice.in_flight > plan.workers { 1.0 } else { 1.5 + threads / choice.in_flight as f64 };
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels; beyond, the pipeline only gets coarser.
     let large = 1.0 + (shape.iter().product::<usize>() as f64 / 16e6).powi(2) * 0.1;
     let partial_chunks =
@@ -170,7 +170,7 @@ fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
     let bytes = brick_bytes(plan, group, shape);
     let mut probe = group.clone();
     probe.brick.shape = shape;
-    let need = bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.threads as u64;
+    let need = bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.workers as u64;
     config.locate(Error::config(
         "run.memory",
         format!(

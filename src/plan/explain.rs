@@ -42,6 +42,9 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
         let (_, device, reason) = &plan.placement[s];
         let _ = writeln!(w, "step {s}: {} -> {} on {device} ({reason})", reads(plan, step), makes(plan, step));
         let _ = writeln!(w, "  {}, reach {:?}, halo beyond the brick {:?}", step.kind.name(), step.reach, step.halo);
+        if plan.shares(s) {
+            let _ = writeln!(w, "  CPU workers take bricks too while the GPU's slots are taken");
+        }
         if step.stages.len() > 1 {
             let _ = writeln!(w, "  one pass for {}", step.stages.join(", "));
         }
@@ -82,7 +85,7 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
     let _ = writeln!(
         w,
         "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {})",
-        mib(brick.peak(plan.threads)),
+        mib(brick.peak(plan.workers)),
         mib(plan.memory),
         mib(brick.bytes * brick.in_flight as u64),
         mib(brick.cache),
@@ -202,7 +205,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
                 "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
                 "brick_bytes": g.brick.bytes, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
                 "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache,
-                "peak_memory_bytes": g.brick.peak(plan.threads), "read_amplification": g.brick.amplification,
+                "peak_memory_bytes": g.brick.peak(plan.workers), "read_amplification": g.brick.amplification,
             })
         })
         .collect();
@@ -227,7 +230,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         "groups": groups,
         "outputs": outputs,
         "placement": plan.placement.iter().map(|(n, d, _)| (n.clone(), json!(d))).collect::<serde_json::Map<_, _>>(),
-        "peak_memory_bytes": plan.groups.iter().map(|g| g.brick.peak(plan.threads)).max(),
+        "peak_memory_bytes": plan.groups.iter().map(|g| g.brick.peak(plan.workers)).max(),
         "memory_budget_bytes": plan.memory,
         "scratch_bytes": sources.iter().map(Source::spool_bytes).sum::<u64>(),
         "read_amplification": plan.groups.iter().map(|g| g.brick.amplification).fold(0.0, f64::max),

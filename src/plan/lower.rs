@@ -532,7 +532,9 @@ impl Lowering<'_> {
         inputs: &[WireId],
     ) -> WireId {
         let src = &self.out.graph.wires[inputs[0]];
-        let most = inputs.iter().map(|&w| self.out.graph.wires[w].components).max().unwrap_or(1);
+        // A sweep's colours and normals have three components; its openness has the density's one.
+        let shaping = if matches!(node.op, Op::Obscurance(_)) { &inputs[..1] } else { inputs };
+        let most = shaping.iter().map(|&w| self.out.graph.wires[w].components).max().unwrap_or(1);
         let (components, component_names) = match channel {
             "rgb" if !matches!(node.op, Op::AmbientLight { .. }) => {
                 (3, ["red", "green", "blue"].map(String::from).to_vec())

@@ -3,7 +3,7 @@
 use super::graph::{Step, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
-use crate::gpu::{facts, passes};
+use crate::gpu::{facts, passes, record, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, obscurance, rank, reduce, window};
 
@@ -97,23 +97,39 @@ fn narrowed(shape: Shape, used: bool) -> usize {
 fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
     let Some(gpu) = &plan.gpu else { return 0 };
     let cap = gpu.buffer_cap(plan.memory);
-    let mut sizes = passes::Sizes::default();
-    for &s in group.steps.iter().filter(|&&s| plan.on_gpu(s)) {
-        let step = &plan.graph.steps[s];
-        let StepKind::Window { params, channels } = &step.kind else { continue };
-        let dst = grown(group.brick.shape, step.halo, group.shape);
-        let src: Shape = std::array::from_fn(|a| {
-            let padded = dst[a] + 2 * step.reach[a];
-            if step.border == Border::Clip { padded.min(group.shape[a]) } else { padded }
-        });
-        let at = std::array::from_fn(|a| step.reach[a].min(src[a] - dst[a]));
-        let needs = window::Needs::of(channels.iter().copied(), false);
-        let dtype = plan.graph.wires[step.inputs[0]].dtype;
-        if let Some(job) = passes::Job::new(dtype, src, dst, at, params.radius, needs) {
-            sizes = sizes.max(job.slot(cap));
-        }
-    }
+    let steps = group.steps.iter().filter(|&&s| plan.on_gpu(s)).map(|&s| &plan.graph.steps[s]);
+    let sizes = steps.map(|s| slot_sizes(plan, group, s, cap)).fold(record::Sizes::default(), record::Sizes::max);
     facts::SLOTS * sizes.host_bytes(gpu.software)
+}
+
+/// Largest buffers that a step needs on the GPU.
+fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Sizes {
+    let dst = grown(group.brick.shape, step.halo, group.shape);
+    let src: Shape = std::array::from_fn(|a| {
+        let padded = dst[a] + 2 * step.reach[a];
+        if step.border == Border::Clip { padded.min(group.shape[a]) } else { padded }
+    });
+    let at: [usize; 3] = std::array::from_fn(|a| step.reach[a].min(src[a] - dst[a]));
+    let dtype = plan.graph.wires[step.inputs[0]].dtype;
+    match &step.kind {
+        StepKind::Window { params, channels } => {
+            let needs = window::Needs::of(channels.iter().copied(), false);
+            let job = passes::Job::new(dtype, src, dst, at, params.radius, needs);
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        }
+        StepKind::Obscurance { params, .. } => {
+            let prepared = obscurance::Prepared::new(params);
+            let from = at.map(|n| n as i64);
+            let inner = Region::new(from, std::array::from_fn(|a| from[a] + dst[a] as i64));
+            let job = sweep::SweepJob::new(&prepared, dtype, Region::whole(src), inner);
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        }
+        StepKind::Gaussian { sigma, .. } => {
+            let job = taps::TapsJob::new(dtype, src, dst, at, *sigma);
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        }
+        _ => record::Sizes::default(),
+    }
 }
 
 /// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.
@@ -181,6 +197,6 @@ pub fn in_flight(threads: usize) -> usize {
 
 /// Bytes for decoded chunks when `bricks` bricks of `brick` bytes are alive.
 pub fn cache_bytes(plan: &Plan, brick: u64, bricks: u64, parked: u64) -> u64 {
-    let fixed = FIXED + PER_THREAD * plan.threads as u64;
+    let fixed = FIXED + PER_THREAD * plan.workers as u64;
     plan.memory.saturating_sub(fixed + parked + brick * bricks)
 }

@@ -18,7 +18,7 @@ pub use explain::explain;
 pub use outputs::{MapPlan, OutputPlan};
 pub use tasks::{Group, Task};
 
-use crate::config::{Config, Device};
+use crate::config::{Config, Device, Lanes};
 use crate::gpu::{GpuFacts, facts};
 use crate::grid::Border;
 use crate::store::VolumeInfo;
@@ -51,6 +51,10 @@ pub struct Plan {
     /// Outputs on lattices of one shape share bricks and tasks.
     pub groups: Vec<Group>,
     pub threads: usize,
+    /// Threads that compute bricks: `threads`, or as many as keep the GPU's slots busy, where most of them wait.
+    pub workers: usize,
+    /// Which stages may give bricks to both lanes.
+    pub lanes: Lanes,
     /// Ceiling in bytes.
     pub memory: u64,
     pub warnings: Vec<String>,
@@ -79,11 +83,16 @@ impl Plan {
             outputs,
             graph,
             threads,
+            workers: if gpu.is_some() { threads.max(facts::SLOTS as usize) } else { threads },
+            lanes: config.run.lanes,
             memory: config.run.memory,
             warnings,
             placement,
             gpu,
         };
+        if plan.waives_byte_identity() {
+            plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
+        }
         plan.groups = tasks::groups(&plan);
         for g in 0..plan.groups.len() {
             plan.groups[g].brick = brick::choose(&plan, &plan.groups[g], config)?;
@@ -122,6 +131,18 @@ impl Plan {
         self.placement[step].1 == "gpu"
     }
 
+    /// Whether a step on the GPU gives bricks to CPU workers while all slots are taken: where results are integers or fixed
+    /// point, and with `lanes = "mixed"` everywhere.
+    pub fn shares(&self, step: StepId) -> bool {
+        self.on_gpu(step) && (self.lanes == Lanes::Mixed || !floats(&self.graph.steps[step]))
+    }
+
+    /// `lanes = "mixed"` with a step whose floats both lanes make.
+    pub fn waives_byte_identity(&self) -> bool {
+        let steps = &self.graph.steps;
+        self.lanes == Lanes::Mixed && (0..steps.len()).any(|s| self.on_gpu(s) && floats(&steps[s]))
+    }
+
     /// Tasks of all groups; their numbers are dense.
     pub fn task_count(&self) -> usize {
         self.groups.iter().map(|g| g.task_count()).sum()
@@ -141,9 +162,15 @@ pub type Placement = Vec<(String, &'static str, String)>;
 
 /// Whether a step that reads `input` has a GPU kernel, or why not.
 fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static str> {
-    let channels = match &step.kind {
-        graph::StepKind::Window { channels, .. } => channels,
+    let windows = match &step.kind {
+        graph::StepKind::Window { channels, .. } => Some(channels),
+        graph::StepKind::Gaussian { .. } => None,
+        graph::StepKind::Gradient { .. } => return Err(facts::GRADIENT),
         graph::StepKind::Rank { .. } => return Err(facts::EXACT),
+        graph::StepKind::Obscurance { channels, normal, .. } => {
+            let plain = normal.is_none() && channels[..] == [graph::ObscuranceChannel::Openness];
+            return facts::obscurance(input.dtype, plain);
+        }
         _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
     };
     if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {
@@ -151,7 +178,19 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
             "the border's constant makes floats of the voxels, for which there is no GPU kernel: runs on the CPU",
         );
     }
-    facts::window(input.dtype, input.missing.is_some(), channels)
+    let missing = input.missing.is_some();
+    match (windows, &step.kind) {
+        (Some(channels), _) => facts::window(input.dtype, missing, channels),
+        (None, graph::StepKind::Gaussian { channels, .. }) => {
+            facts::gaussian(input.dtype, missing, channels.contains(&graph::Moment::Variance))
+        }
+        (None, _) => unreachable!("other kinds of steps have returned"),
+    }
+}
+
+/// Whether a step needs [`GpuFacts::exact_floats`].
+fn floats(step: &graph::Step) -> bool {
+    matches!(step.kind, graph::StepKind::Gaussian { .. })
 }
 
 /// Device of every step. An adapter is looked for where one is demanded, or where `auto` has a step for it.
@@ -174,6 +213,7 @@ fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement
     let place = |s: &graph::Step| match (&found, supported(s)) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
+        (Some(Ok(gpu)), Ok(())) if floats(s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
         (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),

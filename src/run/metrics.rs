@@ -21,6 +21,8 @@ pub struct Metrics {
     waits: Mutex<BTreeMap<&'static str, f64>>,
     /// Nanoseconds and voxels per step.
     steps: Vec<(AtomicU64, AtomicU64)>,
+    /// Bricks per step that the GPU left to the CPU.
+    shared: Vec<AtomicU64>,
     /// Nanoseconds of reading, converting with levels, and encoding.
     pub read_ns: AtomicU64,
     pub encode_ns: AtomicU64,
@@ -42,6 +44,7 @@ impl Metrics {
             skipped: Mutex::default(),
             waits: Mutex::default(),
             steps: (0..steps).map(|_| Default::default()).collect(),
+            shared: (0..steps).map(|_| Default::default()).collect(),
             read_ns: AtomicU64::default(),
             encode_ns: AtomicU64::default(),
             peak: AtomicU64::default(),
@@ -94,6 +97,15 @@ impl Metrics {
     pub fn step(&self, step: usize, start: Instant, voxels: u64) {
         self.steps[step].0.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
         self.steps[step].1.fetch_add(voxels, Relaxed);
+    }
+
+    /// A CPU worker took a brick of a step on the GPU.
+    pub fn shared(&self, step: usize) {
+        self.shared[step].fetch_add(1, Relaxed);
+    }
+
+    pub fn shared_bricks(&self, step: usize) -> u64 {
+        self.shared[step].load(Relaxed)
     }
 
     /// Seconds in a step's kernels (summed over threads) and voxels that it made, halos included.

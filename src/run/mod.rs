@@ -7,6 +7,7 @@ pub mod cache;
 pub mod cancel;
 pub mod compute;
 pub mod journal;
+mod lanes;
 pub mod maps;
 pub mod metrics;
 pub mod options;

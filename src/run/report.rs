@@ -24,6 +24,8 @@ pub struct Report {
     pub waits: BTreeMap<String, f64>,
     /// Stage to device (`cpu`, `gpu`).
     pub placement: BTreeMap<String, String>,
+    /// `lanes = "mixed"` let a float stage's bricks go to either lane: bytes may depend on which took them.
+    pub byte_identity_waived: bool,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -43,4 +45,6 @@ pub struct StageReport {
     pub seconds: f64,
     pub device: String,
     pub voxels: u64,
+    /// Of a stage on the GPU: bricks that CPU workers took while all of its slots were taken.
+    pub bricks_on_cpu: u64,
 }

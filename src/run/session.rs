@@ -88,10 +88,10 @@ impl<'a> Session<'a> {
         let header = journal::header(&hash, &identities, plan.task_count(), &placement, &[]);
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
         let threads = rayon::ThreadPoolBuilder::new()
-            .num_threads(plan.threads)
+            .num_threads(plan.workers)
             .thread_name(|i| format!("compute-{i}"))
             .build()
-            .map_err(|e| Error::Failed(format!("cannot start {} threads: {e}", plan.threads)))?;
+            .map_err(|e| Error::Failed(format!("cannot start {} threads: {e}", plan.workers)))?;
         let tasks = plan.task_count();
         let mut session = Session {
             config,
@@ -257,7 +257,7 @@ impl<'a> Session<'a> {
     }
 
     fn engine(&self) -> Engine<'_> {
-        let mut engine = Engine::new(&self.plan, &self.pool, self.gpu.as_ref(), !self.options.no_skip);
+        let mut engine = Engine::new(&self.plan, &self.pool, self.gpu.as_ref(), &self.metrics, !self.options.no_skip);
         engine.globals = self.globals.clone();
         engine
     }
@@ -336,7 +336,7 @@ impl<'a> Session<'a> {
             brick_bytes: brick.bytes,
             budget: brick.bytes * brick.in_flight as u64,
             brick_voxels: brick.shape.iter().map(|&n| n as u64).product(),
-            threads: self.plan.threads,
+            threads: self.plan.workers,
             pool: &self.threads,
             metrics,
             trace: &self.trace,
@@ -431,10 +431,20 @@ impl<'a> Session<'a> {
         for (s, step) in self.plan.graph.steps.iter().enumerate() {
             let (seconds, voxels) = self.metrics.step_totals(s);
             let device = self.plan.placement[s].1.into();
-            report.stages.push(StageReport { name: step.stages.join("+"), seconds, device, voxels });
+            let bricks_on_cpu = self.metrics.shared_bricks(s);
+            report.stages.push(StageReport { name: step.stages.join("+"), seconds, device, voxels, bricks_on_cpu });
         }
+        report.byte_identity_waived = self.plan.waives_byte_identity();
         report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();
         report
+    }
+
+    /// Destroys the GPU's device, as a driver reset would. For tests.
+    #[doc(hidden)]
+    pub fn lose_gpu(&self, for_good: bool) {
+        if let Some(gpu) = &self.gpu {
+            gpu.lose(for_good);
+        }
     }
 
     /// Wall time since the run was opened.

@@ -2,21 +2,20 @@
 
 use std::collections::HashMap;
 
+use super::metrics::Metrics;
 use super::value::{Comp, Value};
+use crate::Result;
 use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
 use crate::gpu::Gpu;
-use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut, Voxel};
-use crate::kernel::obscurance::{ObscuranceIo, Prepared};
+use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut, Voxel};
+use crate::kernel::obscurance::Prepared;
 use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
 use crate::kernel::{Context, gaussian, gradient, mask, pointwise, rank, window};
 use crate::plan::Plan;
-use crate::plan::graph::{
-    GradientChannel, Mask, Moment, ObscuranceChannel, Step, StepId, StepKind, TransferChannel, Wire,
-};
+use crate::plan::graph::{GradientChannel, Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
 use crate::stage::WindowParams;
-use crate::{Error, Result};
 
 /// What all bricks of a run share.
 pub struct Engine<'a> {
@@ -30,6 +29,7 @@ pub struct Engine<'a> {
     pub pool: &'a Pool,
     /// Runs the steps that the plan placed on it.
     pub gpu: Option<&'a Gpu>,
+    pub(super) metrics: &'a Metrics,
 }
 
 /// A mask over a step's output box: 1 = needed.
@@ -41,14 +41,14 @@ pub enum MaskValue {
 }
 
 impl<'a> Engine<'a> {
-    pub fn new(plan: &'a Plan, pool: &'a Pool, gpu: Option<&'a Gpu>, skip: bool) -> Engine<'a> {
+    pub fn new(plan: &'a Plan, pool: &'a Pool, gpu: Option<&'a Gpu>, metrics: &'a Metrics, skip: bool) -> Engine<'a> {
         let sweeps = (plan.graph.steps.iter().enumerate())
             .filter_map(|(i, s)| match &s.kind {
                 StepKind::Obscurance { params, .. } => Some((i, Prepared::new(params))),
                 _ => None,
             })
             .collect();
-        Engine { plan, level: Level::detect(), sweeps, globals: Vec::new(), skip, pool, gpu }
+        Engine { plan, level: Level::detect(), sweeps, globals: Vec::new(), skip, pool, gpu, metrics }
     }
 
     /// The mask of a step over `region`, from its wire's value.
@@ -184,16 +184,16 @@ impl<'a> Engine<'a> {
             StepKind::Obscurance { channels, colour, normal, .. } => {
                 let sweep = &self.sweeps[&id];
                 self.sweep(
+                    id,
                     sweep,
                     channels,
-                    colour.is_some(),
-                    normal.is_some(),
+                    [colour.is_some(), normal.is_some()],
                     inputs,
                     &mut outputs,
                     region,
                     volume,
                     &mut cx,
-                );
+                )?;
             }
             StepKind::Gradient { size, weight, spacing, channels, stored } => {
                 let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
@@ -226,6 +226,7 @@ impl<'a> Engine<'a> {
     /// Window, rank or Gaussian of one component.
     fn windows(&self, id: StepId, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) -> Result<()> {
         let step = &self.plan.graph.steps[id];
+        let region = outputs[0].region;
         match &step.kind {
             StepKind::Window { params, channels } => {
                 let params = WindowParams { missing: src.missing, ..*params };
@@ -234,12 +235,11 @@ impl<'a> Engine<'a> {
                     .zip(outputs)
                     .map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, c) })
                     .collect();
-                // A single voxel stands for a constant brick: not worth the way to the device, and the bits are the same.
-                let single = outs.iter().all(|o| o.dst.shape() == [1, 1, 1]);
-                match self.gpu.filter(|_| self.plan.on_gpu(id) && !single) {
-                    Some(gpu) => gpu.window(src.view(), &params, src.at, &mut outs, cx).map(|_| ()).map_err(|e| {
-                        Error::Failed(format!("{} on the GPU: {e}; --resume continues", step.stages.join("+")))
-                    })?,
+                match self.lane(id, region) {
+                    Some(gpu) => {
+                        let done = gpu.window(src.view(), &params, src.at, &mut outs, cx);
+                        done.map_err(|e| self.gpu_failed(id, &e))?;
+                    }
                     None => window::window(src.view(), &params, Place::new(src.at, src.voxel), &mut outs, cx),
                 }
             }
@@ -255,61 +255,23 @@ impl<'a> Engine<'a> {
                         Moment::Variance => variance = Some(view_mut(value, c)),
                     }
                 }
-                gaussian::gaussian(src.view(), *sigma, src.affine, src.missing, src.at, mean, variance, cx);
+                match (self.lane(id, region), mean) {
+                    (Some(gpu), Some(mut mean)) => {
+                        let done = gpu.gaussian(src.view(), *sigma, src.affine, src.at, &mut mean, cx);
+                        done.map_err(|e| self.gpu_failed(id, &e))?;
+                    }
+                    (_, mean) => {
+                        gaussian::gaussian(src.view(), *sigma, src.affine, src.missing, src.at, mean, variance, cx);
+                    }
+                }
             }
             _ => unreachable!("only window kernels come here"),
         }
         Ok(())
     }
 
-    #[allow(clippy::too_many_arguments)]
-    fn sweep(
-        &self,
-        sweep: &Prepared,
-        channels: &[ObscuranceChannel],
-        has_colour: bool,
-        has_normal: bool,
-        inputs: &[&Value],
-        outputs: &mut [Value],
-        region: Region,
-        volume: Region,
-        cx: &mut Context,
-    ) {
-        let src_box = region.grow(sweep.reach()).clip(&volume);
-        // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
-        let colour = has_colour.then(|| std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(inputs[1].view(c, src_box))));
-        let colour = colour.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], src_box.shape())));
-        let normal = has_normal.then(|| {
-            let value = inputs[1 + usize::from(has_colour)];
-            std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
-        });
-        let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
-        // Sweeps sum in fixed point and round to f32; results of f64 data are widened.
-        let wide = outputs[0].dtype == DType::F64;
-        let mut narrow_outputs: Vec<Value> = Vec::new();
-        if wide {
-            narrow_outputs = outputs.iter().map(|v| self.buffers(DType::F32, region, v.comps.len())).collect();
-        }
-        let targets = if wide { &mut narrow_outputs[..] } else { &mut *outputs };
-        let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
-        for (channel, value) in channels.iter().zip(targets) {
-            let mut views = views_mut(value);
-            match channel {
-                ObscuranceChannel::Openness => io.openness = views.pop(),
-                ObscuranceChannel::Rgb => io.rgb = Some(three(views)),
-            }
-        }
-        sweep.sweep(inputs[0].view(0, src_box), src_box, region, io, cx);
-        for (from, to) in narrow_outputs.into_iter().zip(outputs) {
-            for c in 0..from.comps.len() {
-                pointwise::scale(from.view(c, region), Affine::IDENTITY, None, view_mut(to, c));
-            }
-            from.recycle(self.pool);
-        }
-    }
-
     /// Uninitialised voxels for a value.
-    fn buffers(&self, dtype: DType, region: Region, comps: usize) -> Value {
+    pub(super) fn buffers(&self, dtype: DType, region: Region, comps: usize) -> Value {
         let buffer = || Comp::Voxels(self.pool.take(dtype, region.voxels()));
         Value { dtype, region, comps: (0..comps).map(|_| buffer()).collect() }
     }
@@ -526,7 +488,7 @@ fn set_at(voxels: &mut Voxels, index: usize, value: f64) {
     crate::with_voxels!(voxels, v => set(v, index, value));
 }
 
-fn view_mut(value: &mut Value, comp: usize) -> AnyViewMut<'_> {
+pub(super) fn view_mut(value: &mut Value, comp: usize) -> AnyViewMut<'_> {
     let shape = value.region.shape();
     match &mut value.comps[comp] {
         Comp::Voxels(v) => v.view_mut(shape),
@@ -534,7 +496,7 @@ fn view_mut(value: &mut Value, comp: usize) -> AnyViewMut<'_> {
     }
 }
 
-fn views_mut(value: &mut Value) -> Vec<AnyViewMut<'_>> {
+pub(super) fn views_mut(value: &mut Value) -> Vec<AnyViewMut<'_>> {
     let shape = value.region.shape();
     value
         .comps
@@ -546,22 +508,9 @@ fn views_mut(value: &mut Value) -> Vec<AnyViewMut<'_>> {
         .collect()
 }
 
-fn three(views: Vec<AnyViewMut<'_>>) -> [AnyViewMut<'_>; 3] {
+pub(super) fn three(views: Vec<AnyViewMut<'_>>) -> [AnyViewMut<'_>; 3] {
     match <[AnyViewMut<'_>; 3]>::try_from(views) {
         Ok(three) => three,
         Err(views) => panic!("{} components where 3 belong", views.len()),
     }
-}
-
-fn narrow(view: AnyView) -> Vec<f32> {
-    fn run<T: Voxel>(v: View<T>) -> Vec<f32> {
-        let mut out = Vec::with_capacity(v.shape.iter().product());
-        for z in 0..v.shape[0] {
-            for y in 0..v.shape[1] {
-                out.extend(v.row_at(z, y).iter().map(|x| x.to_f64() as f32));
-            }
-        }
-        out
-    }
-    crate::with_view!(AnyView, view, v => run(v))
 }

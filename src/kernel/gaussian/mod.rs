@@ -9,6 +9,7 @@
 //! voxel gets depends on its window alone.
 
 mod rows;
+pub mod shared;
 
 use super::Context;
 use super::simd::Level;
@@ -87,6 +88,17 @@ fn ring(src: Shape, radius: [usize; 3]) -> usize {
     (2 * radius[0] + 1).min(src[0])
 }
 
+/// exp(-k^2 / 2 sigma^2).
+fn bell(sigma: f64, k: usize) -> f64 {
+    let x = k as f64 / sigma;
+    if k == 0 { 1.0 } else { (-0.5 * x * x).exp() }
+}
+
+/// Sum of the bell over the taps that exist, given how many voxels there are on both sides.
+fn total(bell: impl Fn(usize) -> f64, radius: usize, before: usize, after: usize) -> f64 {
+    (1..=radius).fold(bell(0), |sum, k| sum + bell(k) * (f64::from(k <= before) + f64::from(k <= after)))
+}
+
 /// What a run of the passes carries.
 #[derive(Clone, Copy, PartialEq)]
 enum Pass {
@@ -131,10 +143,7 @@ impl Table<'_> {
         let bell = &*self.bells[axis];
         let radius = bell.len() - 1;
         let (before, after) = (p, n - 1 - p);
-        let mut total = bell[0];
-        for k in 1..=radius {
-            total += bell[k] * (f64::from(k <= before) + f64::from(k <= after));
-        }
+        let total = total(|k| bell[k], radius, before, after);
         self.weights[0] = bell[0] / total;
         let centre = place(p);
         let gone = (centre as u32, 0.0);
@@ -208,10 +217,7 @@ impl Job<'_> {
         let bells = std::array::from_fn(|a| {
             let (bell, tail) = cut::<f64>(std::mem::take(&mut rest), self.radius[a] + 1);
             rest = tail;
-            for (k, bell) in bell.iter_mut().enumerate() {
-                let x = k as f64 / self.sigma[a];
-                *bell = if k == 0 { 1.0 } else { (-0.5 * x * x).exp() };
-            }
+            bell.iter_mut().enumerate().for_each(|(k, b)| *b = self::bell(self.sigma[a], k));
             bell
         });
         let most = self.radius.into_iter().max().unwrap_or(0);

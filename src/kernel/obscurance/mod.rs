@@ -7,6 +7,7 @@
 //! | `driver` | tiles, sheets, senses |
 //! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide` and `turn`: by AVX-512 |
 //! | `sinks`, `contribute` | what is summed |
+//! | `shared` | what another device needs |
 //! | `reference` | all of it by the definition |
 
 mod contribute;
@@ -18,6 +19,7 @@ mod narrow;
 #[cfg(test)]
 mod reference;
 mod scan;
+pub mod shared;
 mod sinks;
 #[cfg(test)]
 mod tests;

@@ -1,0 +1,134 @@
+#!/usr/bin/env python3
+"""CuPy's uniform, minimum and maximum filters and torch's pooling on a GPU, beside `cargo bench --bench gpu`.
+
+    pip install numpy cupy-cuda12x torch
+    cargo bench --bench gpu && python benches/gpu_rivals.py
+
+The same extents, radii and types as the bench, noise, medians of ten after a warm-up, by events of the device; copies to
+and from the device are timed apart. CuPy with mode "nearest" and its default "reflect". torch pools floats only, pads with
+nothing for max (-inf) and counts existing voxels for the mean, as occlude does. Every result is compared with SciPy on a
+small volume first; one that differs is said so beside its time. Without a GPU the script says what is missing, and exits
+with 3.
+"""
+
+import statistics
+import sys
+
+SIZE, ROUNDS = 256, 10
+
+
+def skip(why):
+    print(f"SKIPPED, nothing measured: {why}", file=sys.stderr)
+    sys.exit(3)
+
+
+def cupy_or_skip():
+    try:
+        import cupy
+        import cupyx.scipy.ndimage as filters
+    except ImportError as e:
+        skip(f"CuPy is not there ({e})")
+    try:
+        count = cupy.cuda.runtime.getDeviceCount()
+    except cupy.cuda.runtime.CUDARuntimeError as e:
+        skip(f"no CUDA device ({e})")
+    if count == 0:
+        skip("no CUDA device")
+    return cupy, filters
+
+
+def timed(cupy, call):
+    """Median milliseconds on the device."""
+    call()
+    times = []
+    for _ in range(ROUNDS):
+        begin, end = cupy.cuda.Event(), cupy.cuda.Event()
+        begin.record()
+        call()
+        end.record()
+        end.synchronize()
+        times.append(cupy.cuda.get_elapsed_time(begin, end))
+    return statistics.median(times)
+
+
+def agrees(cupy, filters, name, radius, mode, dtype):
+    import numpy as np
+    import scipy.ndimage
+
+    v = np.random.default_rng(2).integers(0, 200, (31, 40, 53)).astype(dtype)
+    size = 2 * min(radius, 10) + 1
+    want = getattr(scipy.ndimage, name)(v, size, mode=mode)
+    got = cupy.asnumpy(getattr(filters, name)(cupy.asarray(v), size, mode=mode))
+    return np.array_equal(want, got) if dtype != "float32" else np.allclose(want, got, rtol=1e-5)
+
+
+def rows_of_cupy(cupy, filters):
+    rng = cupy.random.default_rng(1)
+    for dtype in ["uint8", "uint16", "float32"]:
+        v = rng.integers(0, 256 if dtype == "uint8" else 65536, (SIZE,) * 3).astype(dtype)
+        out = cupy.empty_like(v)
+        for radius in [10, 40]:
+            for name in ["uniform_filter", "minimum_filter", "maximum_filter"]:
+                for mode in ["nearest", "reflect"]:
+                    f = getattr(filters, name)
+                    ms = timed(cupy, lambda: f(v, 2 * radius + 1, output=out, mode=mode))
+                    same = agrees(cupy, filters, name, radius, mode, dtype)
+                    yield f"CuPy {name} {mode}", dtype, radius, ms, "" if same else "differs from SciPy"
+
+
+def rows_of_torch(cupy):
+    try:
+        import torch
+        from torch.nn.functional import avg_pool3d, max_pool3d
+    except ImportError as e:
+        print(f"torch is not there ({e}): its pools were not measured", file=sys.stderr)
+        return
+    if not torch.cuda.is_available():
+        print("torch sees no CUDA device: its pools were not measured", file=sys.stderr)
+        return
+    v = torch.rand((1, 1) + (SIZE,) * 3, device="cuda")
+    for radius in [10, 40]:
+        size = 2 * radius + 1
+        pools = {
+            "torch avg_pool3d": lambda: avg_pool3d(v, size, 1, radius, count_include_pad=False),
+            # max_pool3d pads at most half a window, which is all that is asked.
+            "torch max_pool3d": lambda: max_pool3d(v, size, 1, radius),
+        }
+        for name, pool in pools.items():
+            def one():
+                pool()
+                torch.cuda.synchronize()
+
+            yield name, "float32", radius, timed(cupy, one), "events about a synchronised call"
+
+
+def copies(cupy):
+    import numpy as np
+
+    host = np.random.default_rng(3).integers(0, 256, (SIZE,) * 3).astype("u1")
+    pinned = cupy.cuda.alloc_pinned_memory(host.nbytes)
+    staged = np.frombuffer(pinned, "u1", host.size).reshape(host.shape)
+    staged[...] = host
+    device = cupy.empty(host.shape, "u1")
+    yield "copy there, u8, pinned", timed(cupy, lambda: device.set(staged))
+    yield "copy back, u8, pinned", timed(cupy, lambda: device.get(out=staged))
+    large = cupy.empty(1 << 28, "f4")
+    other = cupy.empty_like(large)
+    ms = timed(cupy, lambda: cupy.copyto(other, large))
+    yield f"device copy rate: {2 * large.nbytes / ms / 1e9:.2f} TB/s read and written; 1 GiB", ms
+
+
+def main():
+    cupy, filters = cupy_or_skip()
+    props = cupy.cuda.runtime.getDeviceProperties(0)
+    print(f"{props['name'].decode()}, CuPy {cupy.__version__}, {SIZE}^3, medians of {ROUNDS}, ms")
+    for name, ms in copies(cupy):
+        print(f"{name:<60} {ms:8.3f}")
+    for name, dtype, radius, ms, note in rows_of_cupy(cupy, filters):
+        print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
+    for name, dtype, radius, ms, note in rows_of_torch(cupy):
+        print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
+
+
+if __name__ == "__main__":
+    main()

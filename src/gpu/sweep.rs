@@ -1,0 +1,277 @@
+//! Obscurance: how a brick is cut into parts that fit the device, the tables of displacements and contributions, and one
+//! dispatch (or a few) per family of lines. Pure arithmetic, shared by planner and engine.
+
+use super::passes::cut;
+use super::record::{Buffer, Command, Dispatch, GROUP, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
+use crate::grid::{DType, Region, Shape};
+use crate::kernel::obscurance::{Prepared, shared};
+
+/// A sense that is not swept.
+const NOT_SWEPT: u32 = u32::MAX;
+
+/// Cutting a brick repeats its halo. Beyond this many source voxels per voxel of the uncut box the CPU is the better place.
+const MOST_REPEATED: usize = 4;
+
+/// What one dispatch does; `struct Lines` of `shaders/obscurance.wgsl`, which explains the fields.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Lines {
+    pub planes: u32,
+    pub size: [u32; 2],
+    pub reach: u32,
+    pub code_at: u32,
+    pub code: [u32; 3],
+    pub out: [u32; 3],
+    pub sum: [u32; 3],
+    pub at: [i32; 3],
+    pub shifts: u32,
+    pub tables: [u32; 2],
+    pub packing: u32,
+    pub mask: u32,
+    pub first: u32,
+    pub threads: u32,
+    pub fresh: u32,
+    pub spare: [u32; 3],
+}
+
+/// One call: openness on `dst` of voxels that cover `src`, both in global indices.
+pub struct SweepJob<'a> {
+    pub sweep: &'a Prepared,
+    pub src: Region,
+    pub dst: Region,
+    /// Bytes of a code: 1, 2 or 4.
+    pub code: usize,
+}
+
+/// A box of the output and the voxels that its lines may meet, in global indices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SweepPart {
+    pub dst: Region,
+    pub src: Region,
+}
+
+impl SweepPart {
+    /// Codes per packed row, a whole number of words.
+    pub fn pitch(&self, code: usize) -> usize {
+        self.src.shape()[2].next_multiple_of(4 / code)
+    }
+}
+
+impl<'a> SweepJob<'a> {
+    /// `None` if codes of this type have more than 32 bits, or a line could have more than 2^16 - 1 planes.
+    pub fn new(sweep: &'a Prepared, dtype: DType, src: Region, dst: Region) -> Option<SweepJob<'a>> {
+        let code = shared::code_bytes(dtype)?;
+        let short = src.shape().iter().all(|&n| n < 1 << 16);
+        short.then_some(SweepJob { sweep, src, dst, code })
+    }
+
+    fn part(&self, lo: [usize; 3], shape: Shape) -> SweepPart {
+        let lo: [i64; 3] = std::array::from_fn(|a| self.dst.lo[a] + lo[a] as i64);
+        let dst = Region::new(lo, std::array::from_fn(|a| lo[a] + shape[a] as i64));
+        SweepPart { dst, src: dst.grow(self.sweep.reach()).clip(&self.src) }
+    }
+
+    /// Parts of which every buffer is at most `cap` bytes; `None` where that is not to be had, or not worth it.
+    pub fn parts(&self, cap: u64) -> Option<Vec<SweepPart>> {
+        let fits = |lo, shape| self.sizes(&self.part(lo, shape), cap).is_some_and(|s| s.largest() <= cap);
+        let boxes = cut(self.dst.shape(), fits)?;
+        let parts: Vec<SweepPart> = boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect();
+        let read: usize = parts.iter().map(|p| p.src.voxels()).sum();
+        (parts.len() == 1 || read <= MOST_REPEATED * self.src.voxels()).then_some(parts)
+    }
+
+    /// The voxels that the lines of a family can meet on their way through a part.
+    fn family_box(&self, part: &SweepPart, family: &shared::Lines) -> Region {
+        part.dst.grow(family.halo()).clip(&part.src)
+    }
+
+    /// Lines that are swept at once, so that their links stay below `cap` bytes: whole workgroups.
+    fn batch(planes: usize, lines: usize, cap: u64) -> Option<usize> {
+        let most = (cap / (4 * planes.max(1) as u64)) as usize / GROUP as usize * GROUP as usize;
+        (most > 0).then_some(lines.min(most))
+    }
+
+    fn sizes(&self, part: &SweepPart, cap: u64) -> Option<Sizes> {
+        let [nz, ny, _] = part.src.shape();
+        let voxels = part.dst.voxels() as u64;
+        let (mut dispatches, mut words, mut links) = (0, 0, 0);
+        for family in self.sweep.lines() {
+            let (planes, lines) = extent(&self.family_box(part, &family), family.axis());
+            let batch = Self::batch(planes, lines, cap)?;
+            dispatches += lines.div_ceil(batch) as u64;
+            links = links.max((planes * batch * 4) as u64);
+            let reach = family.reach().min(planes - 1);
+            words += (2 * planes + 2 * (reach + 1)) as u64;
+        }
+        Some(Sizes {
+            params: rounded(dispatches * PARAMS_STRIDE),
+            tables: rounded(words * 4),
+            source: rounded((nz * ny * part.pitch(self.code) * self.code) as u64),
+            a: rounded(voxels * 4),
+            b: rounded(links),
+            read: rounded(voxels * 4),
+        })
+    }
+
+    /// Largest buffers of any part.
+    pub fn slot(&self, cap: u64) -> Sizes {
+        let parts = self.parts(cap).unwrap_or_default();
+        parts.iter().filter_map(|p| self.sizes(p, cap)).fold(Sizes::default(), Sizes::max)
+    }
+
+    /// All families over a part, then the sums. Panics for a part that [`Self::parts`] did not give for this `cap`.
+    pub fn record(&self, part: &SweepPart, cap: u64) -> Recording {
+        let sizes = self.sizes(part, cap).expect("a part that fits");
+        let mut recording = Recording { sizes, ..Recording::default() };
+        for (number, family) in self.sweep.lines().enumerate() {
+            let lines = Lines { fresh: (number == 0) as u32, ..self.lines(part, &family, &mut recording.tables) };
+            let all = (lines.size[0] * lines.size[1]) as usize;
+            let batch = Self::batch(lines.planes as usize, all, cap).expect("a part that fits");
+            for first in (0..all).step_by(batch) {
+                let threads = batch.min(all - first) as u32;
+                let lines = Lines { first: first as u32, threads, ..lines };
+                recording.commands.push(Command::Dispatch(Dispatch {
+                    shader: Shader::Obscurance,
+                    entry: 0,
+                    params: bytemuck::bytes_of(&lines).to_vec(),
+                    bind: vec![Buffer::Source, Buffer::A, Buffer::Tables, Buffer::B],
+                    threads,
+                }));
+            }
+        }
+        let bytes = part.dst.voxels() as u64 * 4;
+        recording.commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to: 0 }));
+        recording
+    }
+
+    /// Parameters of one family; its displacements and contributions are put at the end of `tables`.
+    fn lines(&self, part: &SweepPart, family: &shared::Lines, tables: &mut Vec<u32>) -> Lines {
+        let bounds = self.family_box(part, family);
+        let order = order(family.axis());
+        let (planes, _) = extent(&bounds, family.axis());
+        let reach = family.reach().min(planes - 1);
+        let shifts = tables.len() as u32;
+        let first = bounds.lo[order[0]];
+        for &axis in &order[1..] {
+            let start = family.displacement(axis, first);
+            tables.extend((first..first + planes as i64).map(|k| (family.displacement(axis, k) - start) as i32 as u32));
+        }
+        let starts = [0, 1].map(|way| match family.table(way) {
+            None => NOT_SWEPT,
+            Some(table) => {
+                let start = tables.len() as u32;
+                tables.extend_from_slice(&table[..reach]);
+                tables.push(table[family.reach()]);
+                start
+            }
+        });
+        let pitch = part.pitch(self.code);
+        let code = [part.src.shape()[1] * pitch, pitch, 1];
+        let out = part.dst.shape();
+        let sum = [out[1] * out[2], out[2], 1];
+        let code_at: usize = part.src.offset_of(&bounds).iter().zip(code).map(|(o, s)| o * s).sum();
+        let at = bounds.offset_of(&part.dst);
+        let n = bounds.shape();
+        Lines {
+            planes: planes as u32,
+            size: [n[order[1]] as u32, n[order[2]] as u32],
+            reach: reach as u32,
+            code_at: code_at as u32,
+            code: order.map(|a| code[a] as u32),
+            out: order.map(|a| out[a] as u32),
+            sum: order.map(|a| sum[a] as u32),
+            at: order.map(|a| at[a] as i32),
+            shifts,
+            tables: starts,
+            packing: [2, 1, 0, 0][self.code - 1],
+            mask: u32::MAX >> (32 - 8 * self.code),
+            ..Lines::default()
+        }
+    }
+}
+
+/// Dominant axis, then the others in natural order: neighbouring threads are neighbours along the last.
+fn order(axis: usize) -> [usize; 3] {
+    [[0, 1, 2], [1, 0, 2], [2, 0, 1]][axis]
+}
+
+/// Planes along the dominant axis, and lines of the cross-section.
+fn extent(bounds: &Region, axis: usize) -> (usize, usize) {
+    let n = bounds.shape();
+    (n[axis], n.iter().product::<usize>() / n[axis].max(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::obscurance::ObscuranceParams;
+    use crate::stage::{DirectionSet, DirectionWeights, Rho};
+
+    fn prepared(directions: usize, max_distance: f64, spacing: [f64; 3]) -> Prepared {
+        Prepared::new(&ObscuranceParams {
+            directions,
+            set: if directions == 7 { DirectionSet::Fibonacci } else { DirectionSet::Icosahedron },
+            weights: DirectionWeights::Uniform,
+            rho: Rho::Sqrt,
+            max_distance,
+            spacing,
+            flipped: false,
+            missing: None,
+            ambient: [1.0; 3],
+        })
+    }
+
+    /// What the shader's walk relies on: it follows each thread's line and checks that the voxels of the box are each met
+    /// once, by lines that are lattice lines between two wraps.
+    #[test]
+    fn threads_share_out_the_box_along_lattice_lines() {
+        let sweep = prepared(42, 9.0, [1.0, 0.7, 1.3]);
+        let src = Region::new([3, -2, 11], [20, 12, 30]);
+        let dst = Region::new([8, 1, 15], [14, 9, 24]);
+        let job = SweepJob::new(&sweep, DType::U8, src, dst).unwrap();
+        let part = job.parts(1 << 30).unwrap()[0];
+        let mut tables = Vec::new();
+        for family in sweep.lines() {
+            let p = job.lines(&part, &family, &mut tables);
+            let shift = |k: usize, i: u32| tables[(p.shifts + k as u32 * p.planes + i) as usize] as i32;
+            let bounds = job.family_box(&part, &family);
+            let mut met = vec![0; bounds.voxels()];
+            for line in 0..p.size[0] * p.size[1] {
+                let mut at = [line / p.size[1], line % p.size[1]].map(|v| v as i32);
+                for i in 0..p.planes {
+                    for (k, (at, size)) in at.iter_mut().zip(p.size).enumerate() {
+                        let by = if i > 0 { shift(k, i) - shift(k, i - 1) } else { 0 };
+                        assert!(by.abs() <= 1);
+                        *at = (*at + by).rem_euclid(size as i32);
+                    }
+                    met[((i * p.size[0] + at[0] as u32) * p.size[1] + at[1] as u32) as usize] += 1;
+                }
+            }
+            assert!(met.iter().all(|&n| n == 1));
+        }
+    }
+
+    #[test]
+    fn recordings_are_sound_and_links_stay_below_the_cap() {
+        for (directions, distance) in [(12, 0.0), (42, 6.0), (7, 200.0)] {
+            let sweep = prepared(directions, distance, [1.0; 3]);
+            let src = Region::whole([40, 30, 50]);
+            for (dtype, cap) in [(DType::U8, 1 << 30), (DType::U16, 200_000), (DType::F32, 250_000)] {
+                let job = SweepJob::new(&sweep, dtype, src, Region::new([5, 0, 7], [40, 30, 44])).unwrap();
+                let parts = job.parts(cap).unwrap();
+                let voxels: usize = parts.iter().map(|p| p.dst.voxels()).sum();
+                assert_eq!(voxels, job.dst.voxels());
+                for part in &parts {
+                    let recording = job.record(part, cap);
+                    assert_eq!(recording.fault(), None);
+                    assert!(recording.sizes.largest() <= cap && part.src.contains(&part.dst));
+                    assert!(recording.dispatches().count() >= sweep.lines().len());
+                }
+            }
+        }
+        let sweep = prepared(42, 6.0, [1.0; 3]);
+        let whole = Region::whole([40, 30, 50]);
+        assert!(SweepJob::new(&sweep, DType::F64, whole, whole).is_none());
+        assert!(SweepJob::new(&sweep, DType::U8, whole, whole).unwrap().parts(2000).is_none());
+    }
+}

@@ -1,0 +1,102 @@
+//! Box statistics and estimators on the device: exact sums and extremes there, the CPU's row functions here.
+
+use super::engine::{Gpu, GpuError, Times, run_part};
+use super::facts;
+use super::passes::{Job, Part, Quantity, result_bytes};
+use crate::grid::{AnyView, View, Voxel};
+use crate::kernel::Context;
+use crate::kernel::window::finish::{Sums, Windows, finish};
+use crate::kernel::window::{self, Needs, WindowOut};
+use crate::stage::WindowParams;
+
+impl Gpu {
+    /// The same as [`window::window`], bit for bit, for inputs that [`facts::window`] admits. Windows too large for the
+    /// device even one voxel at a time are computed by the CPU kernel. After a failure the device is opened anew and the
+    /// call tried once more.
+    ///
+    /// Panics where [`window::window`] does.
+    ///
+    /// # Errors
+    /// An input without a kernel, or a second failure of the device.
+    pub fn window(
+        &self,
+        src: AnyView,
+        params: &WindowParams,
+        at: [usize; 3],
+        outs: &mut [WindowOut],
+        cx: &mut Context,
+    ) -> Result<Times, GpuError> {
+        let channels: Vec<_> = outs.iter().map(|o| o.channel).collect();
+        facts::window(src.dtype(), params.missing.is_some(), &channels).map_err(|e| GpuError(e.into()))?;
+        let Some(dst) = outs.first().map(|o| o.dst.shape()) else { return Ok(Times::default()) };
+        assert!((0..3).all(|a| at[a] + dst[a] <= src.shape()[a]), "output {dst:?} at {at:?} sticks out");
+        if dst.contains(&0) {
+            return Ok(Times::default());
+        }
+        let needs = Needs::of(channels.into_iter(), false);
+        let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs);
+        let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap())?))) else {
+            window::window(src, params, window::Place::whole(at), outs, cx); // integers are exact
+            return Ok(Times::default());
+        };
+        self.attempt(|device| {
+            let mut times = Times::default();
+            for part in &parts {
+                let recording = job.record(part);
+                let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, part, job.pitch(part) * job.voxel, out);
+                let mut done = |bytes: Option<&[u8]>| {
+                    let windows = windows(bytes.unwrap_or_default(), part, &job.quantities())?;
+                    finish(src, params, job.at, outs, &windows, cx);
+                    Ok(())
+                };
+                run_part(device, &recording, &mut fill, &mut done, &mut times)?;
+            }
+            Ok(times)
+        })
+    }
+}
+
+/// Writes the voxels that a part sees, in rows of `pitch` bytes; true: there is always work.
+pub(super) fn pack(src: AnyView, part: &Part, pitch: usize, out: &mut wgpu::WriteOnly<[u8]>) -> bool {
+    fn write<T: Voxel + bytemuck::Pod>(v: View<T>, part: &Part, pitch: usize, out: &mut wgpu::WriteOnly<[u8]>) {
+        let v = v.part(part.from, part.src);
+        for z in 0..part.src[0] {
+            for y in 0..part.src[1] {
+                let bytes: &[u8] = bytemuck::cast_slice(v.row_at(z, y));
+                let from = (z * part.src[1] + y) * pitch;
+                // The padding at the end of a row is never read by a shader.
+                out.slice(from..from + bytes.len()).copy_from_slice(bytes);
+            }
+        }
+    }
+    match src {
+        AnyView::U8(v) => write(v, part, pitch, out),
+        AnyView::I8(v) => write(v, part, pitch, out),
+        AnyView::U16(v) => write(v, part, pitch, out),
+        AnyView::I16(v) => write(v, part, pitch, out),
+        other => unreachable!("no job is made of {}", other.dtype()),
+    }
+    true
+}
+
+/// The mapped results of a part by quantity.
+fn windows<'a>(bytes: &'a [u8], part: &Part, quantities: &[Quantity]) -> Result<Windows<'a>, GpuError> {
+    fn cast<T: bytemuck::Pod>(bytes: &[u8]) -> Result<&[T], GpuError> {
+        bytemuck::try_cast_slice(bytes).map_err(|e| GpuError(format!("results are not aligned: {e}")))
+    }
+    let mut out = Windows { lo: part.lo, shape: part.dst, extremes: &[], s1: Sums::None, s2: Sums::None };
+    let mut place = 0;
+    for &quantity in quantities {
+        let len = result_bytes(part, quantity) as usize;
+        let slice = &bytes[place..place + len];
+        match quantity {
+            Quantity::Extremes => out.extremes = cast(slice)?,
+            Quantity::Sum { square, wide } => {
+                let sums = if wide { Sums::Wide(cast(slice)?) } else { Sums::Narrow(cast(slice)?) };
+                *(if square { &mut out.s2 } else { &mut out.s1 }) = sums;
+            }
+        }
+        place += len.next_multiple_of(256);
+    }
+    Ok(out)
+}

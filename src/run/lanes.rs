@@ -1,0 +1,95 @@
+//! Which device runs a step on a box, and the sweep, whose operands are narrowed first, on either.
+
+use super::steps::{Engine, three, view_mut, views_mut};
+use super::value::Value;
+use crate::gpu::{Gpu, GpuError};
+use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
+use crate::kernel::obscurance::{ObscuranceIo, Prepared};
+use crate::kernel::{Context, pointwise};
+use crate::plan::graph::{ObscuranceChannel, StepId};
+use crate::{Error, Result};
+
+impl<'a> Engine<'a> {
+    #[allow(clippy::too_many_arguments)]
+    pub(super) fn sweep(
+        &self,
+        id: StepId,
+        sweep: &Prepared,
+        channels: &[ObscuranceChannel],
+        [has_colour, has_normal]: [bool; 2],
+        inputs: &[&Value],
+        outputs: &mut [Value],
+        region: Region,
+        volume: Region,
+        cx: &mut Context,
+    ) -> Result<()> {
+        let src_box = region.grow(sweep.reach()).clip(&volume);
+        // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
+        let colour = has_colour.then(|| std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(inputs[1].view(c, src_box))));
+        let colour = colour.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], src_box.shape())));
+        let normal = has_normal.then(|| {
+            let value = inputs[1 + usize::from(has_colour)];
+            std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
+        });
+        let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
+        // Sweeps sum in fixed point and round to f32; results of f64 data are widened.
+        let wide = outputs[0].dtype == DType::F64;
+        let mut narrow_outputs: Vec<Value> = Vec::new();
+        if wide {
+            narrow_outputs = outputs.iter().map(|v| self.buffers(DType::F32, region, v.comps.len())).collect();
+        }
+        let targets = if wide { &mut narrow_outputs[..] } else { &mut *outputs };
+        let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
+        for (channel, value) in channels.iter().zip(targets) {
+            let mut views = views_mut(value);
+            match channel {
+                ObscuranceChannel::Openness => io.openness = views.pop(),
+                ObscuranceChannel::Rgb => io.rgb = Some(three(views)),
+            }
+        }
+        let src = inputs[0].view(0, src_box);
+        match (self.lane(id, region), &mut io.openness) {
+            (Some(gpu), Some(AnyViewMut::F32(openness))) => {
+                let done = gpu.obscurance(sweep, src, src_box, region, openness, cx);
+                done.map_err(|e| self.gpu_failed(id, &e))?;
+            }
+            _ => sweep.sweep(src, src_box, region, io, cx),
+        }
+        for (from, to) in narrow_outputs.into_iter().zip(outputs) {
+            for c in 0..from.comps.len() {
+                pointwise::scale(from.view(c, region), Affine::IDENTITY, None, view_mut(to, c));
+            }
+            from.recycle(self.pool);
+        }
+        Ok(())
+    }
+
+    /// The GPU, where it is to run a step on this box: not a single voxel, which stands for a constant brick, and not while
+    /// all slots are taken if the step's bricks may go to either lane. The bits are the same.
+    pub(super) fn lane(&self, id: StepId, region: Region) -> Option<&'a Gpu> {
+        let gpu = self.gpu.filter(|_| self.plan.on_gpu(id) && region.shape() != [1, 1, 1])?;
+        if self.plan.shares(id) && gpu.is_busy() {
+            self.metrics.shared(id);
+            return None;
+        }
+        Some(gpu)
+    }
+
+    pub(super) fn gpu_failed(&self, id: StepId, error: &GpuError) -> Error {
+        let step = &self.plan.graph.steps[id];
+        Error::Failed(format!("{} on the GPU: {error}; --resume continues", step.stages.join("+")))
+    }
+}
+
+fn narrow(view: AnyView) -> Vec<f32> {
+    fn run<T: Voxel>(v: View<T>) -> Vec<f32> {
+        let mut out = Vec::with_capacity(v.shape.iter().product());
+        for z in 0..v.shape[0] {
+            for y in 0..v.shape[1] {
+                out.extend(v.row_at(z, y).iter().map(|x| x.to_f64() as f32));
+            }
+        }
+        out
+    }
+    crate::with_view!(AnyView, view, v => run(v))
+}

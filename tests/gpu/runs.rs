@@ -1,0 +1,354 @@
+//! Whole runs and plans.
+
+use std::path::Path;
+use std::process::Command;
+
+use occlude::gpu::{GpuFacts, facts};
+use occlude::plan::Plan;
+use occlude::run::{RunOptions, Session, Silent};
+
+use super::adapter;
+use super::common::{assert_same, decode, metadata, mixed_u16, parse, program, run_with, u16_bytes, write_npy};
+
+/// Steps that have a GPU kernel, steps that have none, borders, a mask, levels, bricks that are cut.
+const CONFIG: &str = r#"
+[run]
+threads = 2
+brick = [16, 32, 32]
+[input.vol]
+path = "vol.npy"
+slope = 0.5
+intercept = -3
+[stage.stats]
+op = "box"
+input = "vol"
+radius = [2, 3, 5]
+[stage.mirrored]
+op = "ambient_occlusion"
+input = "vol"
+method = "cdf_power"
+radius = 6
+border = "reflect"
+where = { input = "vol", min = 9000 }
+[stage.again]
+op = "ambient_occlusion"
+input = "stats.mean"
+method = "gaussian_cdf"
+radius = 3
+[stage.exact]
+op = "ambient_occlusion"
+input = "vol"
+method = "exact"
+radius = 2
+[stage.swept]
+op = "obscurance"
+input = "vol"
+directions = 12
+max_distance = 7
+[stage.floats]
+op = "obscurance"
+input = "stats.mean"
+max_distance = 4
+where = { input = "vol", max = 20000 }
+[stage.bell]
+op = "gaussian"
+input = "vol"
+sigma = 1.5
+border = "nearest"
+[stage.bells]
+op = "gaussian"
+input = "vol"
+sigma = 0.8
+[output.bell]
+path = "out/bell.zarr"
+from = "bell.mean"
+chunk = 16
+shard = 32
+[output.bells]
+path = "out/bells.zarr"
+from = ["bells.mean", "bells.variance"]
+chunk = 16
+[stage.bleeding]
+op = "obscurance"
+input = "vol"
+directions = 12
+max_distance = 3
+weight_by_normal = true
+[output.swept]
+path = "out/swept.zarr"
+from = ["swept", "floats"]
+chunk = 16
+shard = 32
+[output.bleeding]
+path = "out/bleeding.zarr"
+from = "bleeding"
+chunk = 16
+shard = 32
+[output.stats]
+path = "out/stats.zarr"
+from = ["stats.mean", "stats.min", "stats.max", "stats.variance", "stats.std", "stats.moment2"]
+chunk = 16
+shard = 32
+[output.mirrored]
+path = "out/mirrored.zarr"
+from = "mirrored"
+dtype = "f32"
+chunk = 16
+shard = 32
+[output.again]
+path = "out/again.zarr"
+from = "again"
+chunk = 16
+shard = 32
+[output.exact]
+path = "out/exact.zarr"
+from = "exact"
+chunk = 16
+shard = 32
+"#;
+const OUTPUTS: [&str; 6] = ["stats.zarr", "mirrored.zarr", "again.zarr", "exact.zarr", "swept.zarr", "bleeding.zarr"];
+const SOFTWARE: &str = "run.device='gpu:software'";
+
+fn folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [40, 50, 60];
+    write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+    std::fs::write(dir.path().join("config.toml"), CONFIG).unwrap();
+    dir
+}
+
+fn assert_same_outputs(what: &str, a: &Path, b: &Path) {
+    for name in OUTPUTS {
+        let [a, b] = [a, b].map(|d| d.join("out").join(name));
+        assert_same(&format!("{what}: {name}"), &decode(&a), &decode(&b));
+        assert_eq!(metadata(&a), metadata(&b), "{what}: metadata of {name}");
+    }
+}
+
+#[test]
+fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
+    let Some(_) = adapter() else { return };
+    let (cpu, gpu) = (folder(), folder());
+    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let report = run_with(&parse(gpu.path(), CONFIG, &[SOFTWARE]), &RunOptions::default());
+    assert_same_outputs("gpu:software", cpu.path(), gpu.path());
+    let device = |name: &str| report.stages.iter().find(|s| s.name == name).map(|s| s.device.clone());
+    assert_eq!(device("stats").as_deref(), Some("gpu"));
+    assert_eq!(device("mirrored").as_deref(), Some("gpu"));
+    assert_eq!(device("swept").as_deref(), Some("gpu"));
+    assert_eq!(device("floats").as_deref(), Some("gpu"));
+    assert_eq!(device("bell").as_deref(), Some("gpu"));
+    assert_eq!(device("bells").as_deref(), Some("cpu"));
+    assert_eq!(device("bleeding").as_deref(), Some("cpu"));
+    assert_eq!(device("again").as_deref(), Some("cpu"));
+    assert_eq!(device("exact").as_deref(), Some("cpu"));
+    assert_eq!(report.placement["stats"], "gpu");
+}
+
+#[test]
+fn a_little_memory_cuts_bricks_on_the_device_and_changes_nothing() {
+    let Some(_) = adapter() else { return };
+    let (cpu, gpu) = (folder(), folder());
+    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let config = parse(gpu.path(), CONFIG, &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"]);
+    run_with(&config, &RunOptions::default());
+    assert_same_outputs("40 MiB", cpu.path(), gpu.path());
+}
+
+#[test]
+fn a_run_resumes_on_the_device_that_it_was_begun_on() {
+    let Some(_) = adapter() else { return };
+    let (cpu, gpu) = (folder(), folder());
+    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let config = parse(gpu.path(), CONFIG, &[SOFTWARE]);
+    let options = RunOptions { resume: true, ..Default::default() };
+    let session = Session::open(&config, &options, &Silent).unwrap();
+    session.run_task(0).unwrap();
+    drop(session);
+    let other = parse(gpu.path(), CONFIG, &["run.device='cpu'"]);
+    let error = Session::open(&other, &options, &Silent).err().expect("another placement").to_string();
+    assert!(error.contains("placement"), "{error}");
+    let report = run_with(&config, &options);
+    assert!(report.bricks.resumed > 0);
+    assert_same_outputs("resumed", cpu.path(), gpu.path());
+}
+
+/// Plans with an adapter that need not exist: the planner sees facts only.
+fn plan_with(device: &str, found: Result<GpuFacts, String>) -> occlude::Result<(Plan, usize)> {
+    let dir = folder();
+    let config = parse(dir.path(), CONFIG, &[device]);
+    let infos: Vec<_> = occlude::store::open_inputs(&config)?.iter().map(|s| s.info().clone()).collect();
+    let mut calls = 0;
+    let plan = Plan::new(&config, &infos, &mut || {
+        calls += 1;
+        found.clone()
+    })?;
+    assert!(calls <= 1);
+    Ok((plan, calls))
+}
+
+#[test]
+fn placement_follows_the_device_and_says_why() {
+    let found = |software| GpuFacts { name: "Test 9000".into(), software, most_bytes: 1 << 30, exact_floats: software };
+    let none = || Err("looked for a driver; found no Vulkan adapter".to_string());
+    let on = |plan: &Plan, name: &str| {
+        let place = plan.placement.iter().find(|p| p.0 == name).unwrap();
+        (place.1, place.2.clone())
+    };
+    let (plan, calls) = plan_with("run.device='cpu'", Ok(found(false))).unwrap();
+    assert_eq!((calls, plan.gpu.is_none()), (0, true));
+    let parked = plan.groups[0].brick.parked;
+    let (plan, _) = plan_with("run.device='auto'", Ok(found(false))).unwrap();
+    assert_eq!(on(&plan, "stats"), ("gpu", "Test 9000".into()));
+    assert_eq!(on(&plan, "swept"), ("gpu", "Test 9000".into()));
+    assert_eq!(on(&plan, "bell"), ("cpu", facts::INEXACT.into()));
+    assert!(on(&plan, "bells").1.contains("variance") && on(&plan, "bleeding").1.contains("gradients"));
+    assert!(on(&plan, "again").1.contains("f32") && on(&plan, "exact").1.contains("exact"));
+    let staging = plan.groups[0].brick.parked - parked;
+    let (plan, _) = plan_with("run.device='gpu:software'", Ok(found(true))).unwrap();
+    assert_eq!(on(&plan, "bell"), ("gpu", "Test 9000".into()));
+    assert!(staging > 0 && plan.groups[0].brick.parked - parked > staging, "device memory of software counts");
+    let (plan, _) = plan_with("run.device='auto'", none()).unwrap();
+    assert!(plan.placement.iter().all(|p| p.1 == "cpu"));
+    assert!(on(&plan, "stats").1.contains("no Vulkan adapter"));
+    for device in ["gpu", "gpu:software"] {
+        let error = plan_with(&format!("run.device='{device}'"), none()).unwrap_err();
+        assert_eq!(error.exit_code(), 1);
+        assert!(error.to_string().contains("looked for a driver") && error.to_string().contains(device), "{error}");
+    }
+}
+
+#[test]
+fn without_a_driver_gpu_fails_and_auto_runs_on_the_cpu_and_says_so() {
+    let dir = folder();
+    let command = |device: &str| {
+        let mut c = Command::new(program());
+        // The Vulkan loader finds no driver under these names.
+        c.env("VK_DRIVER_FILES", "/nowhere.json").env("VK_ICD_FILENAMES", "/nowhere.json");
+        let out = c.arg("run").arg(dir.path().join("config.toml")).args(["--device", device]).output().unwrap();
+        (out.status.code(), String::from_utf8_lossy(&out.stderr).into_owned())
+    };
+    for device in ["gpu", "gpu:software"] {
+        let (code, text) = command(device);
+        assert_eq!(code, Some(1), "{text}");
+        assert!(text.contains("looked for") && text.contains("no Vulkan adapter"), "{text}");
+    }
+    let (code, text) = command("auto");
+    assert_eq!(code, Some(0), "{text}");
+    assert!(text.contains("running on the CPU"), "{text}");
+}
+
+#[test]
+fn many_workers_share_bricks_between_the_lanes() {
+    let Some(_) = adapter() else { return };
+    let (cpu, pure, mixed) = (folder(), folder(), folder());
+    let bricks = "run.brick=[8, 16, 32]";
+    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let run = |dir: &Path, sets: &[&str]| {
+        let config = parse(dir, CONFIG, &[&[SOFTWARE, bricks, "run.threads=8"], sets].concat());
+        let report = run_with(&config, &RunOptions::default());
+        let on_cpu = |name: &str| report.stages.iter().find(|s| s.name == name).map_or(0, |s| s.bricks_on_cpu);
+        (report.byte_identity_waived, ["swept", "floats", "stats", "mirrored", "bell"].map(on_cpu))
+    };
+    let (waived, shared) = run(pure.path(), &[]);
+    assert!(!waived && shared.iter().sum::<u64>() > 0, "8 workers and 3 slots: {shared:?}");
+    assert_eq!(shared[4], 0, "floats stay on one lane");
+    assert_same_outputs("shared", cpu.path(), pure.path());
+    let (waived, _) = run(mixed.path(), &["run.lanes='mixed'"]);
+    assert!(waived);
+    for name in OUTPUTS {
+        let [a, b] = [&cpu, &mixed].map(|d| decode(&d.path().join("out").join(name)));
+        // Waived, yet this adapter's floats are the CPU's.
+        assert_same(&format!("mixed: {name}"), &a, &b);
+    }
+}
+
+#[test]
+fn workers_fill_the_ring_and_its_staging_is_counted() {
+    let facts = GpuFacts { name: "Test 9000".into(), software: false, most_bytes: 1 << 30, exact_floats: true };
+    let (plan, _) = plan_with("run.device='auto'", Ok(facts)).unwrap();
+    assert!(facts::SLOTS >= 3 && plan.threads == 2 && plan.workers == facts::SLOTS as usize);
+    assert!(plan.groups[0].brick.in_flight as u64 > facts::SLOTS);
+    assert!(plan.groups[0].brick.parked as usize > 3 * 40 * 50 * 60 / 8, "three bricks' voxels and sums");
+    let (plan, _) = plan_with("run.device='cpu'", Err("none".into())).unwrap();
+    assert_eq!(plan.workers, 2);
+}
+
+/// A volume long enough for three tasks.
+const LONG: &str = r#"
+[run]
+threads = 2
+brick = [8, 8, 128]
+[input.vol]
+path = "vol.npy"
+[stage.stats]
+op = "box"
+input = "vol"
+radius = 3
+[stage.swept]
+op = "obscurance"
+input = "vol"
+directions = 12
+max_distance = 5
+[stage.bell]
+op = "gaussian"
+input = "vol"
+sigma = 1.1
+[output.stats]
+path = "out/stats.zarr"
+from = "stats.variance"
+chunk = [8, 8, 32]
+shard = [8, 8, 64]
+[output.swept]
+path = "out/swept.zarr"
+from = "swept"
+chunk = [8, 8, 32]
+shard = [8, 8, 64]
+[output.bell]
+path = "out/bell.zarr"
+from = "bell.mean"
+chunk = [8, 8, 32]
+shard = [8, 8, 64]
+"#;
+
+#[test]
+fn a_device_lost_in_a_run_is_opened_anew_or_ends_it_resumable() {
+    let Some(_) = adapter() else { return };
+    let long = || {
+        let dir = tempfile::tempdir().unwrap();
+        let shape = [7, 8, 1100];
+        write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+        dir
+    };
+    let same = |what: &str, a: &Path, b: &Path| {
+        for name in ["stats.zarr", "swept.zarr", "bell.zarr"] {
+            let [a, b] = [a, b].map(|d| decode(&d.join("out").join(name)));
+            assert_same(&format!("{what}: {name}"), &a, &b);
+        }
+    };
+    let (cpu, once, twice) = (long(), long(), long());
+    run_with(&parse(cpu.path(), LONG, &["run.device='cpu'"]), &RunOptions::default());
+    let options = RunOptions { resume: true, ..Default::default() };
+    let config = parse(once.path(), LONG, &[SOFTWARE]);
+    let session = Session::open(&config, &options, &Silent).unwrap();
+    let tasks = session.task_count();
+    assert!(tasks > 2, "{tasks} tasks");
+    for task in 0..tasks {
+        session.lose_gpu(false);
+        session.run_task(task).unwrap();
+    }
+    session.finish().unwrap();
+    same("lost and opened anew", cpu.path(), once.path());
+    let config = parse(twice.path(), LONG, &[SOFTWARE]);
+    let session = Session::open(&config, &options, &Silent).unwrap();
+    session.run_task(0).unwrap();
+    session.lose_gpu(true);
+    let error = session.run_task(1).expect_err("no device is left");
+    assert_eq!(error.exit_code(), 1);
+    let text = error.to_string();
+    assert!(text.contains("on the GPU") && text.contains("--resume continues"), "{text}");
+    drop(session);
+    let report = run_with(&config, &options);
+    assert!(report.bricks.resumed > 0, "what was finished is kept");
+    same("resumed after a loss", cpu.path(), twice.path());
+}
