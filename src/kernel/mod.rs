@@ -10,6 +10,7 @@ pub mod gaussian;
 pub mod gradient;
 #[cfg(test)]
 pub(crate) mod hostile;
+pub mod levels;
 pub mod mask;
 pub mod obscurance;
 pub mod occlusion_map;
