@@ -11,6 +11,7 @@ pub mod gradient;
 #[cfg(test)]
 pub(crate) mod hostile;
 pub mod lanes;
+pub mod levels;
 pub mod mask;
 pub mod obscurance;
 pub mod occlusion_map;

@@ -5,6 +5,8 @@
 //! missing voxels never enter, and n is a product of extents, or a second count where voxels are missing. Everything is
 //! counted in integers, so nothing depends on brick, order or instruction set.
 
+mod buckets;
+mod coded;
 mod compare;
 mod slide;
 mod vector;
@@ -24,7 +26,7 @@ pub fn rank(
     shape: WindowShape,
     ties: Ties,
     at: [usize; 3],
-    dst: AnyViewMut,
+    mut dst: AnyViewMut,
     cx: &mut Context,
 ) {
     let (from, to) = (src.shape(), dst.shape());
@@ -41,6 +43,21 @@ pub fn rank(
             let missing = missing_as(params.missing);
             count_all::<_, $key, $lanes>(cx.level, $view, missing, flipped, &plan, bytes, dst)
         }};
+    }
+    if let (true, AnyViewMut::F32(dst)) = (coded::serves(&plan), &mut dst) {
+        macro_rules! coded {
+            ($view:expr, $key:ty) => {{
+                let source = coded::Source { view: $view, missing: missing_as(params.missing), flipped };
+                return coded::count_all::<_, $key>(cx.level, &source, &plan, bytes, dst);
+            }};
+        }
+        match src {
+            AnyView::U8(v) => coded!(v, i8),
+            AnyView::I8(v) => coded!(v, i8),
+            AnyView::U16(v) => coded!(v, i16),
+            AnyView::I16(v) => coded!(v, i16),
+            _ => {}
+        }
     }
     match src {
         AnyView::U8(v) if plan.slides() => {
@@ -72,7 +89,12 @@ pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams
         _ => padded::<f64>(voxels),
     };
     let columns = if dtype.size() == 1 { padded::<u16>(slide::columns(&plan)) } else { 0 };
-    keys + padded::<i8>(voxels) + columns
+    let coded = match dtype.size() {
+        1 => coded::scratch_bytes::<i8>(&plan),
+        2 => coded::scratch_bytes::<i16>(&plan),
+        _ => 0,
+    };
+    (keys + padded::<i8>(voxels) + columns).max(coded)
 }
 
 /// Where windows lie: all that does not depend on the element type.

@@ -1,0 +1,4 @@
+//! Window counts at many thresholds at once.
+
+pub(crate) mod sums;
+mod vector;
