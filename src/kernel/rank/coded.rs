@@ -110,8 +110,7 @@ pub(super) fn count_all<T: ToKey<K>, K: Index>(
                 let part = Source { view: source.view.part(from, tile.src), ..*source };
                 let (codes, bytes) = cut::<u8>(bytes, tile.codes());
                 let start = dst.data.len().min(z * dst.plane + y * dst.row + x);
-                let mut out =
-                    ViewMut { data: &mut dst.data[start..], shape: tile.dst, plane: dst.plane, row: dst.row };
+                let mut out = ViewMut { data: &mut dst.data[start..], shape: tile.dst, plane: dst.plane, row: dst.row };
                 count_tile::<T, K>(level, &part, &tile, plan.ties, table, codes, bytes, &mut out);
             }
         }

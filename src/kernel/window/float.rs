@@ -6,8 +6,8 @@
 
 use super::along::SLACK;
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
+use super::extremes::{blocked, deep_len, rows_extremes};
 use super::float_estimate::{self as est, Centre};
-use super::int::{blocked, deep_len, rows_extremes};
 use super::lines::{self, Coding, Elem, Masked, Sources};
 use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};

@@ -7,7 +7,8 @@
 use super::along::SLACK;
 use super::emit::{Emit, IntRow};
 use super::estimate::{Acc, Code, RowSum, Width};
-use super::lines::{self, Add, Block, Coding, Elem, Lines, Masked, Op, Sources};
+use super::extremes::{blocked, deep_len, rows_extremes};
+use super::lines::{self, Add, Coding, Masked, Op, Sources};
 use super::plan::{Job, Plain, Stage, Tile, bits, cut, padded};
 use crate::grid::View;
 use crate::kernel::simd::Level;
@@ -466,73 +467,4 @@ fn planes_extremes<T: Code + Plain, const M: bool>(
             work,
         );
     }
-}
-
-/// Extremes over y of a block of output rows from `j` on.
-#[allow(clippy::too_many_arguments)]
-pub fn rows_extremes<T: Elem>(
-    level: Level,
-    job: &Job,
-    from: [&[T]; 2],
-    j: usize,
-    plain: Coding<T>,
-    lo: &mut [T],
-    hi: &mut [T],
-    work: &mut [T],
-) {
-    let lines = Lines { base: 0, pitch: job.pitch, first: j as isize, clip: (0, job.height as isize) };
-    let (w, out) = (job.window[1], (0, job.pitch));
-    blocked(
-        level,
-        (job.rows, job.row_block),
-        Masked::<false>,
-        Sources::<true>,
-        from,
-        lines,
-        w,
-        job.pitch,
-        plain,
-        lo,
-        hi,
-        out,
-        work,
-    );
-}
-
-/// Extremes of `outputs` lines from `lines` on, by blocks of a length known at run time, or by [`lines::deep_extremes`].
-#[allow(clippy::too_many_arguments)]
-pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
-    level: Level,
-    (outputs, block): (usize, usize),
-    masked: Masked<M>,
-    sources: Sources<TWO>,
-    src: [&[T]; 2],
-    lines: Lines,
-    w: usize,
-    cols: usize,
-    coding: Coding<T>,
-    lo: &mut [T],
-    hi: &mut [T],
-    out: (usize, usize),
-    work: &mut [T],
-) {
-    if w >= lines::DEEP && block == 8 && outputs > 8 && cols >= T::CHUNK.as_ref().len() {
-        lines::deep_extremes(level, masked, sources, src, lines, w, cols, coding, outputs / 8, lo, hi, out, work);
-        return;
-    }
-    for k in (0..outputs).step_by(block) {
-        let lines = Lines { first: lines.first + k as isize, ..lines };
-        let out = (out.0 + k * out.1, out.1);
-        match block {
-            1 => lines::extremes(level, Block::<1>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
-            4 => lines::extremes(level, Block::<4>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
-            8 => lines::extremes(level, Block::<8>, masked, sources, src, lines, w, cols, coding, lo, hi, out),
-            _ => unreachable!("blocks are 1, 4 or 8 lines"),
-        }
-    }
-}
-
-/// Elements of work that both axes of [`blocked`] need.
-pub fn deep_len(job: &Job) -> usize {
-    lines::deep_len(job.window[0].max(job.window[1]), job.batch.max(job.rows) / 8, job.pitch)
 }

@@ -14,6 +14,7 @@ mod beta;
 mod emit;
 mod estimate;
 mod exact;
+mod extremes;
 pub mod finish;
 mod float;
 mod float_estimate;

@@ -1,7 +1,8 @@
 //! Which moments a set of channels needs, how a call is cut into tiles, and how its scratch is laid out.
 
 use super::Place;
-use super::lines::{DEEP, Lines};
+use super::extremes::DEEP;
+use super::lines::Lines;
 use super::parts::{Axis, BLOCK};
 use crate::grid::{DType, Shape, View};
 use crate::stage::{Method, WindowChannel, WindowParams};
@@ -213,7 +214,7 @@ fn odd_lines(n: usize) -> usize {
     (n.div_ceil(64) | 1) * 64
 }
 
-/// Outputs made together by `lines::extremes`: 1, 4 or 8, at most the window.
+/// Outputs made together by `extremes::extremes`: 1, 4 or 8, at most the window.
 fn block(window: usize, outputs: usize) -> usize {
     match window {
         ..4 => 1,
