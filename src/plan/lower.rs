@@ -122,7 +122,8 @@ impl Lowering<'_> {
         let node = &self.config.stages[stage];
         for (key, input) in node.reads() {
             // A colour bleeds into the channel rgb alone.
-            if if key == "colour" { first_rgb } else { first } {
+            let unseen = if key == "colour" { first_rgb } else { first };
+            if unseen {
                 self.want(input, &node.place)?;
             }
         }

@@ -87,7 +87,7 @@ impl Look<'_> {
         Ok(())
     }
 
-    /// The value of every component of an input over a box of which nothing is stored.
+    /// What an input (its last component) holds over a box of which nothing is stored; `None` where something is.
     fn constant(&self, wire: WireId, region: Region) -> Option<f64> {
         let wire = &self.plan.graph.wires[wire];
         let Producer::Input(input) = wire.producer else { return None };
