@@ -1,8 +1,9 @@
 //! Speed and accuracy of obscurance sweeps, one thread.
 //!
-//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT]`: CPU seconds of the best
-//! of several sweeps over a cube of 256^3 voxels, by field, element type, reach and instruction set; or, with
-//! `--accuracy`, errors of direction sets against 6000 directions.
+//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT | --bricks DISTANCE | --halves]`:
+//! CPU seconds of the best of several sweeps over a cube of 256^3 voxels, by field, element type, reach and instruction set;
+//! with `--accuracy`, errors of direction sets against 6000 directions; with `--bricks`, what halos cost; with `--halves`, two
+//! threads.
 
 use occlude::brick::Scratch;
 use occlude::grid::{AnyView, AnyViewMut, Region, Shape, View, ViewMut};
@@ -102,10 +103,72 @@ fn row(name: &str, kind: &str, level: Level, p: &ObscuranceParams, view: AnyView
     );
 }
 
+/// Bricks from the middle of a volume of 384^3, with their halos.
+fn bricks(max_distance: f64) {
+    let edge = 384;
+    let shape = [edge; 3];
+    let data: Vec<u8> = field("ct", shape).iter().map(|v| (v * 256.0) as u8).collect();
+    let p = ObscuranceParams { max_distance, ..params() };
+    let prepared = Prepared::new(&p);
+    let mut scratch = Scratch::new();
+    for brick in [[64; 3], [64, 128, 128], [128; 3], [128, 128, 256], [128, 256, 256], [256, 128, 256], [256; 3]] {
+        let lo = brick.map(|n: usize| ((edge - n) / 2) as i64);
+        let dst = Region::new(lo, std::array::from_fn(|a| lo[a] + brick[a] as i64));
+        let src = dst.grow(prepared.reach()).clip(&Region::whole(shape));
+        let view = View::dense(&data, shape).part(src.lo.map(|v| v as usize), src.shape());
+        let mut out = vec![0f32; dst.voxels()];
+        let mut best = f64::INFINITY;
+        for _ in 0..2 {
+            let openness = Some(AnyViewMut::F32(ViewMut::dense(&mut out, brick)));
+            let io = ObscuranceIo { colour: None, normal: None, openness, rgb: None };
+            let start = cpu_seconds();
+            let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+            prepared.sweep(AnyView::U8(view), src, dst, io, &mut cx);
+            best = best.min(cpu_seconds() - start);
+        }
+        let each = best * 1e9 / dst.voxels() as f64 / p.directions as f64;
+        let reads = src.voxels() as f64 / dst.voxels() as f64;
+        println!("{brick:?} dmax {max_distance:>4}  reads {reads:5.2}  {each:6.3} ns/voxel/direction");
+    }
+}
+
+/// Wall-clock seconds of two threads that sweep a half of the cube each, halos included.
+fn halves(edge: usize) {
+    let shape = [edge; 3];
+    let data: Vec<u8> = field("ct", shape).iter().map(|v| (v * 256.0) as u8).collect();
+    let prepared = Prepared::new(&params());
+    let whole = Region::whole(shape);
+    let half = (edge / 2) as i64;
+    let mut out = vec![0f32; whole.voxels()];
+    let mut scratches = [Scratch::new(), Scratch::new()];
+    for _ in 0..4 {
+        let start = std::time::Instant::now();
+        std::thread::scope(|scope| {
+            for ((part, out), scratch) in (0..).zip(out.chunks_mut(whole.voxels() / 2)).zip(&mut scratches) {
+                let (prepared, data) = (&prepared, &data);
+                scope.spawn(move || {
+                    let mut dst = whole;
+                    (dst.lo[0], dst.hi[0]) = (part * half, (part + 1) * half);
+                    let src = dst.grow(prepared.reach()).clip(&whole);
+                    let view = View::dense(data, shape).part(src.lo.map(|v| v as usize), src.shape());
+                    let openness = Some(AnyViewMut::F32(ViewMut::dense(out, dst.shape())));
+                    let io = ObscuranceIo { colour: None, normal: None, openness, rgb: None };
+                    let mut cx = Context { level: Level::detect(), scratch };
+                    prepared.sweep(AnyView::U8(view), src, dst, io, &mut cx);
+                });
+            }
+        });
+        println!("two threads, a half of {edge}^3 each, dmax 64: {:.3} s", start.elapsed().as_secs_f64());
+    }
+}
+
 fn speed(edge: usize, only: Option<&str>) {
     let shape = [edge; 3];
     let wanted = |name: &str| only.is_none_or(|o| name.contains(o));
     for name in ["ct", "sparse", "noise", "ramp x", "ramp", "falling", "plateaus"] {
+        if !only.is_none_or(|o| o.contains(name)) {
+            continue;
+        }
         let values = field(name, shape);
         let u8s: Vec<u8> = values.iter().map(|v| (v * 256.0) as u8).collect();
         let view = AnyView::U8(View::dense(&u8s, shape));
@@ -181,6 +244,12 @@ fn main() {
     let after = |key: &str| args.iter().position(|a| a == key).map(|i| &args[i + 1..]);
     if after("--accuracy").is_some() {
         return accuracy();
+    }
+    if after("--halves").is_some() {
+        return halves(256);
+    }
+    if let Some([distance, ..]) = after("--bricks") {
+        return bricks(distance.parse().expect("a distance in voxels"));
     }
     if let Some([file, z, y, x, ..]) = after("--raw") {
         let shape = [z, y, x].map(|n| n.parse().expect("an extent"));

@@ -83,9 +83,18 @@ pub struct ObscuranceIo<'a> {
 }
 
 /// Output voxels whose sums are kept at once, `[z, y, x]`. Long lines waste less on halos than sums gain from a nearer
-/// cache: 2-core Zen 4 VM, AVX-512, 2026-11-23, 256^3 u8, 42 directions, distance 64: 0.85 s; `[128, 128, 256]` 0.96 s,
-/// `[64, 128, 256]` 1.21 s, and `[256; 3]` 0.82 s for twice the memory.
-const TILE: Shape = [256, 128, 256];
+/// cache: 2-core Zen 4 VM, AVX-512, 2026-11-26, u8, 42 directions, distance 64, bricks with halos of 64: `[256, 128, 256]`
+/// in one tile 0.76 ns per voxel and direction, `[128, 256, 256]` in two tiles 1.08. A sweep of one tile keeps one copy of
+/// the keys, so that 256^3 takes the bytes of two tiles of half the size.
+const TILE: Shape = [256; 3];
+/// The same for sums of 64 bits, which take five times as much.
+const WEIGHTED_TILE: Shape = [256, 128, 256];
+
+/// Extents of a tile of an output box.
+fn tile_of(dst: Shape, weighted: bool) -> Shape {
+    let most = if weighted { WEIGHTED_TILE } else { TILE };
+    std::array::from_fn(|a| most[a].min(dst[a]))
+}
 
 impl Prepared {
     /// Panics on a spacing or distance that is not positive.
@@ -119,11 +128,11 @@ impl Prepared {
     /// Bytes of scratch that [`Self::sweep`] takes at most.
     pub fn scratch_bytes(&self, dtype: DType, src: Shape, dst: Shape, colour: bool, normal: bool) -> usize {
         let key = dtype.size();
-        self.sizes(src, dst).bytes(key, colour, normal)
+        self.sizes(src, dst, colour || normal).bytes(key, colour, normal)
     }
 
-    fn sizes(&self, src: Shape, dst: Shape) -> Sizes {
-        let tile: Shape = std::array::from_fn(|a| TILE[a].min(dst[a]));
+    fn sizes(&self, src: Shape, dst: Shape, weighted: bool) -> Sizes {
+        let tile = tile_of(dst, weighted);
         let planes = |f: &lines::Family| (tile[f.axis] + 2 * driver::reach_in(f, src[f.axis])).min(src[f.axis]);
         let turned = self.families.iter().any(|f| f.axis == 2);
         let copies = [keys::padded_len(src), if turned { keys::padded_len(FRAMES[1].map(|a| src[a])) } else { 0 }];
@@ -145,7 +154,8 @@ impl Prepared {
         io: ObscuranceIo,
         cx: &mut Context,
     ) {
-        let sizes = self.sizes(src_box.shape(), dst_box.shape());
+        let weighted = io.rgb.is_some() || io.normal.is_some();
+        let sizes = self.sizes(src_box.shape(), dst_box.shape(), weighted);
         let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()));
         let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
@@ -235,9 +245,9 @@ impl<K: Key> Pass<'_, K> {
         let fast = openness.is_some() && normal.is_none();
         let weighted = rgb.is_some() || normal.is_some();
         let dst_box = self.dst_box;
-        let cells = dst_box.cells(dst_box.lo, TILE);
-        for cell in cells.iter() {
-            let tile = Region::of_cell(cell, dst_box.lo, TILE).clip(&dst_box);
+        let extents = tile_of(dst_box.shape(), weighted);
+        for cell in dst_box.cells(dst_box.lo, extents).iter() {
+            let tile = Region::of_cell(cell, dst_box.lo, extents).clip(&dst_box);
             let voxels = tile.voxels();
             let len = |frame: usize| if fast { sinks::sums_len(tile.shape(), FRAMES[frame]) } else { 0 };
             let (natural, rest) = carve::<u32>(&mut *bytes, len(0));

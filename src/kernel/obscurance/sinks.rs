@@ -178,6 +178,15 @@ pub(super) const WIDE: f64 = (1u64 << 30) as f64;
 /// Colours beyond this are cut off, so that sums of thousands fit.
 const MAX_COLOUR: f64 = (1u64 << 18) as f64;
 
+/// `v` in units of `1 / WIDE`, rounded half to even; `|v|` below 2^21, which a clamped colour times a weight below 8 is.
+/// An addition rounds as fast on every CPU, where the instruction that rounds may be a call.
+#[inline(always)]
+fn fixed(v: f64) -> i64 {
+    /// Beside it doubles are integers.
+    const MAGIC: f64 = (3u64 << 51) as f64;
+    ((v * WIDE + MAGIC).to_bits() as i64).wrapping_sub(MAGIC.to_bits() as i64)
+}
+
 /// Openness or colour with weights per voxel and direction. Sums are in the natural order of the tile.
 pub(super) struct WeightedSum<'a> {
     /// The output tile, and the whole output box that `normal` covers.
@@ -245,7 +254,6 @@ impl WeightedSum<'_> {
         let n = self.tile.shape();
         let local: [usize; 3] = std::array::from_fn(|a| (p[a] - self.tile.lo[a]) as usize);
         let i = (local[0] * n[1] + local[1]) * n[2] + local[2];
-        let fixed = |v: f64| (v * WIDE).round_ties_even() as i64;
         self.weights[i] += fixed(weight);
         self.open[i] += fixed(weight * rho);
         let Some(colour) = &self.colour else { return };
@@ -257,8 +265,9 @@ impl WeightedSum<'_> {
             colour.map(|v| v.at(at) as f64)
         };
         for (sum, c) in self.rgb.iter_mut().zip(seen) {
-            // NaN as an integer is 0: a colour that is not there adds nothing.
-            sum[i] += fixed(weight * rho * c.clamp(-MAX_COLOUR, MAX_COLOUR));
+            // A colour that is not there adds nothing.
+            let c = if c.is_nan() { 0.0 } else { c.clamp(-MAX_COLOUR, MAX_COLOUR) };
+            sum[i] += fixed(weight * rho * c);
         }
     }
 }
