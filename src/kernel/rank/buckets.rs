@@ -163,7 +163,9 @@ multiversion! {
 fn within_inner([z, y, x]: [&[u16]; 3], low: [u16; 3], reach: [u16; 3]) -> u32 {
     const RUN: usize = 64;
     let inside = |z: u16, y: u16, x: u16| {
-        (z.wrapping_sub(low[0]) <= reach[0]) & (y.wrapping_sub(low[1]) <= reach[1]) & (x.wrapping_sub(low[2]) <= reach[2])
+        (z.wrapping_sub(low[0]) <= reach[0])
+            & (y.wrapping_sub(low[1]) <= reach[1])
+            & (x.wrapping_sub(low[2]) <= reach[2])
     };
     let (zs, zt) = z.as_chunks::<RUN>();
     let (ys, yt) = y.as_chunks::<RUN>();
