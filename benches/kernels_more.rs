@@ -1,4 +1,4 @@
-//! Times exact rank, Gaussian, the occlusion-map chain and gradient on one core: ns per output voxel, Mvoxel/s, and the
+//! Times exact rank, quantile levels (beside `cdf_power`), Gaussian, the occlusion-map chain and gradient on one core: ns per output voxel, Mvoxel/s, and the
 //! multiple of the time that memcpy takes for the same voxels of a 256^3 volume in this process. Each kernel's result on
 //! this CPU's level is compared with that of the portable code first.
 //!
@@ -12,10 +12,12 @@ use occlude::grid::{Affine, AnyView, DType, Region, Shape, Voxel};
 use occlude::kernel::Context;
 use occlude::kernel::gaussian::{gaussian, reach};
 use occlude::kernel::gradient::{GradientOut, gradient};
+use occlude::kernel::levels::{Levels, levels};
 use occlude::kernel::occlusion_map::{Moments, base, coarsen};
 use occlude::kernel::rank::rank;
 use occlude::kernel::simd::Level;
-use occlude::stage::{GradientWeight, Ties, WindowParams, WindowShape};
+use occlude::kernel::window::{Place, WindowOut, window};
+use occlude::stage::{GradientWeight, Method, Ties, WindowChannel, WindowParams, WindowShape};
 
 /// Voxels of the output box: rows as a brick of the planner has them.
 const BOX: Shape = [64, 64, 256];
@@ -31,8 +33,16 @@ fn main() {
                 report(&name, copy, &mut job);
             }
         };
-        for (window, radius) in [(WindowShape::Box, 5), (WindowShape::Box, 10), (WindowShape::Ball, 5)] {
+        for (window, radius) in
+            [(WindowShape::Box, 5), (WindowShape::Box, 10), (WindowShape::Box, 64), (WindowShape::Ball, 5)]
+        {
             row(format!("rank {window:?} radius {radius}"), rank_job(dtype, window, radius));
+        }
+        for (count, radius) in [(32, 5), (32, 10), (32, 64), (64, 10)] {
+            row(format!("levels {count} radius {radius}"), levels_job(dtype, count, radius));
+        }
+        for radius in [10, 64] {
+            row(format!("window cdf_power radius {radius}"), power_job(dtype, radius));
         }
         for moment in ["mean", "variance"] {
             row(format!("gaussian sigma 3 {moment}"), gaussian_job(dtype, moment == "variance"));
@@ -146,6 +156,33 @@ fn rank_job<'a>(dtype: DType, window: WindowShape, radius: usize) -> Job<'a> {
     let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
     Job::new(dtype, [radius; 3], move |src, at, out, cx| {
         rank(src, &params, window, Ties::Le, at, out.view_mut(BOX), cx);
+    })
+}
+
+/// Levels of the field, from every 97th voxel.
+fn levels_job<'a>(dtype: DType, count: usize, radius: usize) -> Job<'a> {
+    let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
+    let mut chosen = None;
+    Job::new(dtype, [radius; 3], move |src, at, out, cx| {
+        let chosen = chosen.get_or_insert_with(|| {
+            let n: usize = src.shape().iter().product();
+            let place = |i: usize| {
+                [i / src.shape()[2] / src.shape()[1], i / src.shape()[2] % src.shape()[1], i % src.shape()[2]]
+            };
+            let mut values: Vec<f64> = (0..n).step_by(97).map(|i| src.at_f64(place(i))).collect();
+            values.sort_by(f64::total_cmp);
+            let groups = values.chunk_by(|a, b| a == b).map(|g| (g[0], g.len() as u64));
+            Levels::choose(&groups.collect::<Vec<_>>(), count)
+        });
+        levels(src, chosen, &params, Ties::Le, at, out.view_mut(BOX), cx);
+    })
+}
+
+fn power_job<'a>(dtype: DType, radius: usize) -> Job<'a> {
+    let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
+    Job::new(dtype, [radius; 3], move |src, at, out, cx| {
+        let channel = WindowChannel::Openness(Method::CdfPower, Ties::Le);
+        window(src, &params, Place::whole(at), &mut [WindowOut { channel, dst: out.view_mut(BOX) }], cx);
     })
 }
 

@@ -138,6 +138,8 @@ fn wrong_lines_are_named_with_value_and_what_would_do() {
         (11, 7, "", "stage.ao.method", &["missing", "\"exact\""]),
         (11, 11, "method = \"cdf\"", "stage.ao.method", &["got \"cdf\"", "\"cdf_power\""]),
         (11, 12, "method = \"chebyshev\"\nregion = \"ball\"", "stage.ao.region", &["exact"]),
+        (11, 12, "method = \"exact\"\nlevel_count = 16", "stage.ao.level_count", &["\"levels\" only"]),
+        (11, 12, "method = \"levels\"\nlevel_count = 65", "stage.ao.level_count", &["65"]),
         (11, 12, "method = \"exact\"\nties = \"lt\"", "stage.ao.ties", &["\"le\" or \"mid\""]),
         (11, 12, "method = \"exact\"\nborder = \"wrap\"", "stage.ao.border", &["clip"]),
         (11, 12, "method = \"exact\"\nborder = \"constant\"", "stage.ao.border", &["needs its value"]),

@@ -29,6 +29,14 @@ input = "vol"
 method = "exact"
 radius = 2
 border = "reflect"
+[stage.shares]
+op = "ambient_occlusion"
+input = "vol"
+method = "levels"
+level_count = 16
+radius = [2, 3, 4]
+solid = "low"
+border = "nearest"
 [stage.bell]
 op = "gaussian"
 input = "vol"
@@ -84,6 +92,11 @@ from = ["stats.min", "stats.max"]
 chunk = [16, 8, 16]
 shard = "none"
 codec = "zstd:1"
+[output.shares]
+path = "out/shares.zarr"
+from = "shares"
+chunk = 16
+dtype = "native"
 [output.ao]
 path = "out/ao.zarr"
 from = "ao"

@@ -71,7 +71,8 @@ pub fn op_channels(op: &str) -> &'static [&'static str] {
     }
 }
 
-pub(super) const METHODS: &[&str] = &["exact", "cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal", "beta"];
+pub(super) const METHODS: &[&str] =
+    &["exact", "cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal", "beta", "levels"];
 pub(super) const FORMATS: &[&str] =
     &["ome-zarr-0.5", "ome-zarr-0.4", "nrrd", "nii", "npy", "raw", "0.5", "0.4", "zarr3", "zarr2", "nifti"];
 /// Fields that `synthetic` names; the store makes them.
@@ -160,6 +161,7 @@ pub const KEYS: &[Key] = &[
     stage(&["gaussian"], "sigma", Kind::Sigma, Required, "standard deviation; truncated at ceil(3 sigma)"),
     stage(&["occlusion_map"], "start_level", Kind::Int { min: 0, max: 1 }, Toml("1"), "level of the map that is dataset 0 of its output"),
     stage(&["ambient_occlusion"], "method", Kind::Choice(METHODS), Required, "estimator of openness"),
+    stage(&["ambient_occlusion"], "level_count", Kind::Int { min: 8, max: 64 }, Toml("32"), "method levels only: quantile levels of the volume's values"),
     stage(&["ambient_occlusion"], "ties", Kind::Choice(&["le", "mid"]), Toml("\"le\""), "how voxels equal to the centre count"),
     stage(&["ambient_occlusion"], "region", Kind::Choice(&["box", "equal_volume", "ball"]), Toml("\"box\""), "shape of the window; ball for method exact only"),
     stage(&["ambient_occlusion", "obscurance"], "solid", Kind::Choice(&["high", "low"]), Toml("\"high\""), "whether larger or smaller scaled values are solid"),

@@ -174,18 +174,64 @@ pub enum AoRegion {
 
 #[derive(Debug, Clone)]
 pub enum Op {
-    Box { input: Ref, radius: Length },
-    Gaussian { input: Ref, sigma: Length },
-    OcclusionMap { input: Ref, start_level: usize },
-    AmbientOcclusion { input: Ref, radius: Length, method: Method, ties: Ties, region: AoRegion, solid_low: bool },
+    Box {
+        input: Ref,
+        radius: Length,
+    },
+    Gaussian {
+        input: Ref,
+        sigma: Length,
+    },
+    OcclusionMap {
+        input: Ref,
+        start_level: usize,
+    },
+    AmbientOcclusion {
+        input: Ref,
+        radius: Length,
+        method: Method,
+        ties: Ties,
+        region: AoRegion,
+        solid_low: bool,
+        /// Quantile levels; read by [`Method::Levels`].
+        level_count: usize,
+    },
     Obscurance(ObscuranceOp),
-    Transfer { input: Ref, points: Vec<TransferPoint> },
-    Window { input: Ref, low: f64, high: f64, mode: WindowMode },
-    OpacityModulation { input: Ref, by: Ref, rule: Modulation },
-    Gradient { input: Ref, size: usize, weight: GradientWeight },
-    Saliency { input: Ref, size: usize, weight: GradientWeight, scale_max: bool },
-    AmbientLight { input: Ref, rgb: Ref, k: f64 },
-    Combine { inputs: Vec<Ref>, kind: CombineKind },
+    Transfer {
+        input: Ref,
+        points: Vec<TransferPoint>,
+    },
+    Window {
+        input: Ref,
+        low: f64,
+        high: f64,
+        mode: WindowMode,
+    },
+    OpacityModulation {
+        input: Ref,
+        by: Ref,
+        rule: Modulation,
+    },
+    Gradient {
+        input: Ref,
+        size: usize,
+        weight: GradientWeight,
+    },
+    Saliency {
+        input: Ref,
+        size: usize,
+        weight: GradientWeight,
+        scale_max: bool,
+    },
+    AmbientLight {
+        input: Ref,
+        rgb: Ref,
+        k: f64,
+    },
+    Combine {
+        inputs: Vec<Ref>,
+        kind: CombineKind,
+    },
 }
 
 #[derive(Debug, Clone)]

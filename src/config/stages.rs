@@ -101,12 +101,16 @@ fn ambient_occlusion(r: &Reader, input: Ref) -> Result<Op> {
         ("chebyshev", Method::Chebyshev),
         ("chebyshev_literal", Method::ChebyshevLiteral),
         ("beta", Method::Beta),
+        ("levels", Method::Levels),
     ];
     let regions = [("box", AoRegion::Box), ("equal_volume", AoRegion::EqualVolume), ("ball", AoRegion::Ball)];
     let method = r.choice("method", &methods)?;
     let region = r.choice("region", &regions)?;
     if region == AoRegion::Ball && method != Method::Exact {
         return Err(r.error("region", "\"ball\" is for method \"exact\" only; expected \"box\" or \"equal_volume\""));
+    }
+    if r.has("level_count") && method != Method::Levels {
+        return Err(r.error("level_count", "is for method \"levels\" only; leave it out, or use that method"));
     }
     let ties = r.choice("ties", &[("le", Ties::Le), ("mid", Ties::Mid)])?;
     Ok(Op::AmbientOcclusion {
@@ -116,6 +120,7 @@ fn ambient_occlusion(r: &Reader, input: Ref) -> Result<Op> {
         ties,
         region,
         solid_low: solid_low(r)?,
+        level_count: r.int("level_count")? as usize,
     })
 }
 

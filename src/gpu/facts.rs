@@ -30,6 +30,9 @@ pub const EXACT: &str = "no GPU kernel for exact openness: runs on the CPU";
 /// Why the beta distribution stays on the CPU.
 pub const BETA: &str = "no GPU kernel for method \"beta\": runs on the CPU";
 
+/// Why quantile levels stay on the CPU.
+pub const LEVELS: &str = "no GPU kernel for method \"levels\": runs on the CPU";
+
 /// Bricks that are on the GPU's way at once: one is packed, one computes, one is read back and finished.
 pub const SLOTS: u64 = 3;
 
@@ -45,6 +48,9 @@ impl GpuFacts {
 pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result<(), &'static str> {
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Exact, _))) {
         return Err(EXACT);
+    }
+    if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Levels, _))) {
+        return Err(LEVELS);
     }
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Beta, _))) {
         return Err(BETA);
@@ -103,6 +109,7 @@ mod tests {
         let open = |method| [WindowChannel::Openness(method, Ties::Le)];
         assert_eq!(window(DType::U8, false, &open(Method::Beta)), Err(BETA));
         assert_eq!(window(DType::U8, false, &open(Method::Exact)), Err(EXACT));
+        assert_eq!(window(DType::U8, false, &open(Method::Levels)), Err(LEVELS));
         assert_eq!(window(DType::U8, false, &open(Method::CdfPower)), Ok(()));
     }
 }

@@ -99,6 +99,12 @@ pub enum StepKind {
         shape: WindowShape,
         ties: Ties,
     },
+    /// Openness by quantile levels that a pre-pass found.
+    Levels {
+        params: WindowParams,
+        levels: GlobalId,
+        ties: Ties,
+    },
     Gaussian {
         sigma: [f64; 3],
         channels: Vec<Moment>,
@@ -231,6 +237,7 @@ impl StepKind {
         match self {
             StepKind::Window { .. } => "window",
             StepKind::Rank { .. } => "rank",
+            StepKind::Levels { .. } => "levels",
             StepKind::Gaussian { .. } => "gaussian",
             StepKind::Gradient { .. } => "gradient",
             StepKind::Transfer { .. } => "transfer",

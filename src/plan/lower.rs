@@ -199,7 +199,7 @@ impl Lowering<'_> {
                 let channels = wanted.iter().map(|c| (*c, box_channel(c))).collect();
                 self.window(index, node, src, radius, false, channels)
             }
-            Op::AmbientOcclusion { input, radius, method, ties, region, solid_low } => {
+            Op::AmbientOcclusion { input, radius, method, ties, region, solid_low, level_count } => {
                 let src = self.wire(input, place)?;
                 let mut radius = lengths::radius(radius, self.lattice(src), &key("radius"))?;
                 if *region == AoRegion::EqualVolume {
@@ -210,6 +210,12 @@ impl Lowering<'_> {
                     let shape = if *region == AoRegion::Ball { WindowShape::Ball } else { WindowShape::Box };
                     let params = self.window_params(src, radius, *solid_low);
                     let kind = StepKind::Rank { params, shape, ties: *ties };
+                    return self.push_step(index, node, kind, vec![src], radius, node.border, wanted);
+                }
+                if *method == Method::Levels {
+                    let params = self.window_params(src, radius, *solid_low);
+                    let kind = PrepassKind::Levels { count: *level_count, flipped: params.flipped() };
+                    let kind = StepKind::Levels { params, levels: self.prepass(src, kind), ties: *ties };
                     return self.push_step(index, node, kind, vec![src], radius, node.border, wanted);
                 }
                 let channels = vec![("openness", WindowChannel::Openness(*method, *ties))];
@@ -294,6 +300,15 @@ impl Lowering<'_> {
             return Err(Error::config(key, message));
         }
         Ok(())
+    }
+
+    /// The pre-pass of this kind over a wire: an earlier stage's, or a new one.
+    fn prepass(&mut self, wire: WireId, kind: PrepassKind) -> usize {
+        let new = Prepass { wires: vec![wire], kind };
+        self.out.prepasses.iter().position(|p| *p == new).unwrap_or_else(|| {
+            self.out.prepasses.push(new);
+            self.out.prepasses.len() - 1
+        })
     }
 
     fn window_params(&self, src: WireId, radius: [usize; 3], solid_low: bool) -> WindowParams {

@@ -5,7 +5,7 @@ use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
 use crate::gpu::{facts, passes, record, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
-use crate::kernel::{gaussian, gradient, obscurance, rank, reduce, window};
+use crate::kernel::{gaussian, gradient, levels, obscurance, rank, reduce, window};
 
 /// What the program itself, thread stacks and the allocator's slack take of the ceiling.
 pub const FIXED: u64 = 16 << 20;
@@ -71,6 +71,7 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     let kernel = match &step.kind {
         StepKind::Window { params, channels } => window::scratch_bytes(dtype, src, dst, params, channels),
         StepKind::Rank { params, shape, .. } => rank::scratch_bytes(dtype, src, dst, params, *shape),
+        StepKind::Levels { params, .. } => levels::scratch_bytes(dtype, src, dst, params),
         StepKind::Gaussian { sigma, channels } => gaussian::scratch_bytes(dtype, src, dst, *sigma, channels.len() > 1),
         StepKind::Gradient { size, .. } => gradient::scratch_bytes(dtype, src, dst, *size),
         StepKind::Obscurance { params, colour, normal, .. } => {

@@ -37,6 +37,8 @@ pub enum PrepassKind {
     Max,
     /// Least and largest value (`range = "auto"`).
     MinMax,
+    /// Quantile levels (`method = "levels"`); `flipped` where smaller stored values are denser.
+    Levels { count: usize, flipped: bool },
 }
 
 /// Finds a GPU, or says what was looked for.
@@ -149,8 +151,8 @@ impl Plan {
     }
 
     /// Values of pre-pass `id` that are known so far.
-    pub fn global(globals: &[[f64; 2]], id: GlobalId) -> [f64; 2] {
-        globals.get(id).copied().unwrap_or([0.0, 1.0])
+    pub fn global(globals: &[Vec<f64>], id: GlobalId) -> [f64; 2] {
+        globals.get(id).and_then(|g| Some([*g.first()?, *g.get(1)?])).unwrap_or([0.0, 1.0])
     }
 }
 
@@ -171,6 +173,7 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
             let plain = normal.is_none() && channels[..] == [graph::ObscuranceChannel::Openness];
             return facts::obscurance(input.dtype, plain);
         }
+        graph::StepKind::Levels { .. } => return Err(facts::LEVELS),
         _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
     };
     if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {

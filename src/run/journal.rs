@@ -85,7 +85,7 @@ pub fn remove(dir: &Path) {
 }
 
 /// The header: everything that must be the same for a run to continue.
-pub fn header(config_hash: &str, inputs: &[Value], tasks: usize, placement: &Value, globals: &[[f64; 2]]) -> Value {
+pub fn header(config_hash: &str, inputs: &[Value], tasks: usize, placement: &Value, globals: &[Vec<f64>]) -> Value {
     json!({
         "version": env!("CARGO_PKG_VERSION"),
         "config_hash": config_hash,
@@ -93,14 +93,15 @@ pub fn header(config_hash: &str, inputs: &[Value], tasks: usize, placement: &Val
         "tasks": tasks,
         "placement": placement,
         // As bits: text may lose NaN and the last digit.
-        "globals": globals.iter().map(|g| g.map(f64::to_bits)).collect::<Vec<_>>(),
+        "globals": globals.iter().map(|g| g.iter().map(|v| v.to_bits()).collect()).collect::<Vec<Vec<u64>>>(),
     })
 }
 
 /// Pre-pass results kept in a header.
-pub fn globals(header: &Value) -> Vec<[f64; 2]> {
+pub fn globals(header: &Value) -> Vec<Vec<f64>> {
     let list = header["globals"].as_array().cloned().unwrap_or_default();
-    list.iter().filter_map(|g| Some([f64::from_bits(g[0].as_u64()?), f64::from_bits(g[1].as_u64()?)])).collect()
+    let numbers = |g: &Value| g.as_array()?.iter().map(|v| v.as_u64().map(f64::from_bits)).collect();
+    list.iter().filter_map(numbers).collect()
 }
 
 /// The part of a header that differs and forbids to continue, in words.
@@ -122,7 +123,7 @@ mod tests {
     #[test]
     fn a_torn_line_counts_for_nothing_and_the_next_run_goes_on() {
         let dir = tempfile::tempdir().unwrap();
-        let head = header("h", &[], 3, &json!({}), &[[f64::NAN, 0.1]]);
+        let head = header("h", &[], 3, &json!({}), &[vec![f64::NAN, 0.1]]);
         let journal = Journal::open(dir.path(), &head, false).unwrap();
         journal.done(2).unwrap();
         drop(journal);

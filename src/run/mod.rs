@@ -18,6 +18,7 @@ pub mod read;
 pub mod report;
 pub mod second;
 pub mod session;
+pub mod sketch;
 pub mod steps;
 pub mod stream;
 pub mod trace;

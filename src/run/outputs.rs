@@ -21,7 +21,7 @@ pub enum Start {
     /// Tasks that are done, and the pre-pass results found then.
     Resume {
         done: Vec<usize>,
-        globals: Vec<[f64; 2]>,
+        globals: Vec<Vec<f64>>,
     },
     /// Every output is complete already.
     Complete,
@@ -117,7 +117,7 @@ fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Res
 }
 
 /// Opens every output of a group that is not complete.
-pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[[f64; 2]], resume: bool) -> Result<Target> {
+pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], resume: bool) -> Result<Target> {
     let output = &plan.outputs[o];
     let sink = Sink::create(output.spec.clone(), resume)?;
     let dir = Sink::work_dir(&output.spec.path);
@@ -139,7 +139,7 @@ pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[[f64; 2]], r
 }
 
 /// The values that map to 0 and the largest code, from the config or a pre-pass.
-pub fn range_of(output: &OutputPlan, globals: &[[f64; 2]]) -> Option<[f64; 2]> {
+pub fn range_of(output: &OutputPlan, globals: &[Vec<f64>]) -> Option<[f64; 2]> {
     match output.auto_range {
         Some(id) => {
             let [lo, hi] = Plan::global(globals, id);

@@ -3,10 +3,46 @@
 use std::sync::Mutex;
 
 use super::compute::Finished;
+use super::sketch::Sketch;
 use super::value::Comp;
-use crate::grid::{AnyView, Region, Voxel};
+use crate::grid::{AnyView, Region, Shape, Voxel};
 use crate::plan::graph::WireId;
-use crate::plan::{Plan, PrepassKind};
+use crate::plan::{Plan, Prepass, PrepassKind};
+
+/// What a pre-pass collects.
+#[derive(Debug)]
+pub enum Finder {
+    MinMax(MinMax),
+    Levels(Sketch),
+}
+
+impl Finder {
+    pub fn new(plan: &Plan, prepass: &Prepass, volume: Shape) -> Finder {
+        match prepass.kind {
+            PrepassKind::Levels { .. } => Finder::Levels(Sketch::new(plan.graph.wires[prepass.wires[0]].dtype, volume)),
+            PrepassKind::Max | PrepassKind::MinMax => Finder::MinMax(MinMax::default()),
+        }
+    }
+
+    /// Takes in a finished brick's wires.
+    pub fn add(&self, plan: &Plan, wires: &[WireId], done: &Finished) {
+        match self {
+            Finder::MinMax(found) => found.add(plan, wires, done),
+            Finder::Levels(sketch) => sketch.add(plan, wires, done),
+        }
+    }
+
+    /// The numbers that steps and outputs read.
+    pub fn result(self, kind: PrepassKind) -> Vec<f64> {
+        match (self, kind) {
+            (Finder::Levels(sketch), PrepassKind::Levels { count, flipped }) => {
+                sketch.levels(count, flipped).to_numbers()
+            }
+            (Finder::MinMax(found), kind) => found.result(kind).to_vec(),
+            (Finder::Levels(_), _) => Vec::new(),
+        }
+    }
+}
 
 /// Least and largest value so far, NaN and missing voxels apart. Order never matters.
 #[derive(Debug)]
@@ -44,7 +80,7 @@ impl MinMax {
         match (kind, found[0] <= found[1]) {
             (_, true) => found,
             (PrepassKind::Max, false) => [0.0, 0.0],
-            (PrepassKind::MinMax, false) => [0.0, 1.0],
+            (_, false) => [0.0, 1.0],
         }
     }
 }

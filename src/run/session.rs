@@ -13,7 +13,7 @@ use super::journal::{self, Journal};
 use super::metrics::Metrics;
 use super::options::{Progress, RunOptions};
 use super::outputs::{self, Start};
-use super::prepass::MinMax;
+use super::prepass::Finder;
 use super::program::Program;
 use super::read::Reader;
 use super::report::{Report, StageReport};
@@ -51,7 +51,7 @@ pub struct Session<'a> {
     targets: Vec<Option<Target>>,
     journal: Option<Journal>,
     done: Vec<bool>,
-    globals: Vec<[f64; 2]>,
+    globals: Vec<Vec<f64>>,
     threads: rayon::ThreadPool,
     pool: Pool,
     metrics: Metrics,
@@ -284,8 +284,8 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Least and largest value of a pre-pass's wires over the whole volume.
-    fn prepass(&self, id: usize) -> Result<[f64; 2]> {
+    /// What a pre-pass finds over the whole volume.
+    fn prepass(&self, id: usize) -> Result<Vec<f64>> {
         let prepass = &self.plan.prepasses[id];
         let lattice = &self.plan.graph.lattices[self.plan.graph.wires[prepass.wires[0]].lattice];
         let group = self.plan.groups.iter().find(|g| g.shape == lattice.shape).unwrap_or(&self.plan.groups[0]);
@@ -296,7 +296,7 @@ impl<'a> Session<'a> {
         cells.sort_by_key(|c| morton(*c));
         let bricks = cells.into_iter().map(|c| Region::of_cell(c, [0; 3], group.brick.shape).clip(&whole));
         let work: Vec<Work> = bricks.map(|brick| Work { brick, slot: 0 }).collect();
-        let found = MinMax::default();
+        let found = Finder::new(&self.plan, prepass, lattice.shape);
         let deliver = |done: &Finished, _: Work, _: &mut Scratch| {
             found.add(&self.plan, &prepass.wires, done);
             Ok(Vec::new())

@@ -12,7 +12,7 @@ use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, Vie
 use crate::kernel::obscurance::Prepared;
 use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
-use crate::kernel::{Context, gaussian, gradient, mask, pointwise, rank, window};
+use crate::kernel::{Context, gaussian, gradient, levels, mask, pointwise, rank, window};
 use crate::plan::Plan;
 use crate::plan::graph::{GradientChannel, Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
 use crate::stage::WindowParams;
@@ -23,7 +23,7 @@ pub struct Engine<'a> {
     pub level: Level,
     pub sweeps: HashMap<StepId, Prepared>,
     /// Results of the pre-passes so far.
-    pub globals: Vec<[f64; 2]>,
+    pub globals: Vec<Vec<f64>>,
     /// Constants are propagated instead of computed.
     pub skip: bool,
     pub pool: &'a Pool,
@@ -210,7 +210,7 @@ impl<'a> Engine<'a> {
                 gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
                 src.recycle(self.pool);
             }
-            StepKind::Window { .. } | StepKind::Rank { .. } | StepKind::Gaussian { .. } => {
+            StepKind::Window { .. } | StepKind::Rank { .. } | StepKind::Levels { .. } | StepKind::Gaussian { .. } => {
                 for c in 0..input_wire.components {
                     let src = self.windowed(step, inputs[0], c, input_wire, region, volume);
                     self.windows(id, &src, &mut outputs, c, &mut cx)?;
@@ -246,6 +246,11 @@ impl<'a> Engine<'a> {
             StepKind::Rank { params, shape, ties } => {
                 let params = WindowParams { missing: src.missing, ..*params };
                 rank::rank(src.view(), &params, *shape, *ties, src.at, view_mut(&mut outputs[0], c), cx);
+            }
+            StepKind::Levels { params, levels, ties } => {
+                let params = WindowParams { missing: src.missing, ..*params };
+                let found = levels::Levels::from_numbers(&self.globals[*levels]);
+                levels::levels(src.view(), &found, &params, *ties, src.at, view_mut(&mut outputs[0], c), cx);
             }
             StepKind::Gaussian { sigma, channels } => {
                 let (mut mean, mut variance) = (None, None);

@@ -17,6 +17,8 @@ pub enum Method {
     ChebyshevLiteral,
     /// Beta distribution on the window's [min, max] with its mean and variance.
     Beta,
+    /// Window counts at quantile levels of the whole volume, interpolated between levels.
+    Levels,
 }
 
 /// How voxels equal to the centre count.

@@ -41,10 +41,15 @@ impl Tile {
         (2 * self.radius[axis] + 1).min(self.src[axis])
     }
 
+    /// Whether counts of columns fit in their bytes.
+    pub fn planes_fit(&self) -> bool {
+        self.most(0) <= usize::from(u8::MAX)
+    }
+
     /// Whether counts of columns fit in their bytes and counts of windows in `S`.
     pub fn fits<S: Sum>(&self) -> bool {
         let window = (0..3).map(|a| self.most(a) as u64).product::<u64>();
-        self.most(0) <= usize::from(u8::MAX) && window <= S::MOST
+        self.planes_fit() && window <= S::MOST
     }
 
     /// Codes of the source box.
@@ -142,8 +147,11 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
         let both = leaving.len() == 1 && entering.len() == 1;
         if !both {
             for (y, columns) in columns.chunks_exact_mut(pitch).enumerate() {
-                leaving.clone().for_each(|z| count_voxels(level, &order, codes_of(z, y), columns, u8::MAX));
-                entering.clone().for_each(|z| count_voxels(level, &order, codes_of(z, y), columns, 1));
+                leaving.clone().for_each(|z| leave(level, &order, codes_of(z, y), columns));
+                if !entering.is_empty() {
+                    let first = &codes[entering.start * plane + y * width..];
+                    enter(level, &order, first, plane, entering.len(), width, columns);
+                }
             }
         }
         planes = now;
@@ -181,16 +189,47 @@ fn counts<const L: usize>(order: &[u8; L], group: usize, code: u8) -> [u8; L] {
 }
 
 multiversion! {
-    /// Adds `by` to the lanes of each column that count its voxel.
-    fn count_voxels[const L: usize](order: &[u8; L], codes: &[u8], columns: &mut [[u8; L]], by: u8) -> () = count_voxels_inner;
+    /// Lets a row's voxels of several planes, `stride` codes apart, into its columns.
+    fn enter[const L: usize](
+        order: &[u8; L], codes: &[u8], stride: usize, planes: usize, width: usize, columns: &mut [[u8; L]],
+    ) -> () = enter_inner;
 }
 
 #[inline(always)]
-fn count_voxels_inner<const L: usize>(order: &[u8; L], codes: &[u8], columns: &mut [[u8; L]], by: u8) {
+fn enter_inner<const L: usize>(
+    order: &[u8; L],
+    codes: &[u8],
+    stride: usize,
+    planes: usize,
+    width: usize,
+    columns: &mut [[u8; L]],
+) {
+    for (g, columns) in columns.chunks_exact_mut(width).enumerate() {
+        let thresholds = order.map(|lane| lane + (g * L) as u8);
+        for (x, column) in columns.iter_mut().enumerate() {
+            // A copy, so that it stays in registers.
+            let mut counts = *column;
+            for code in codes[x..].iter().step_by(stride).take(planes) {
+                for k in 0..L {
+                    counts[k] = counts[k].wrapping_add((thresholds[k] >= *code) as u8);
+                }
+            }
+            *column = counts;
+        }
+    }
+}
+
+multiversion! {
+    /// Takes a row's voxels of one plane out of its columns.
+    fn leave[const L: usize](order: &[u8; L], codes: &[u8], columns: &mut [[u8; L]]) -> () = leave_inner;
+}
+
+#[inline(always)]
+fn leave_inner<const L: usize>(order: &[u8; L], codes: &[u8], columns: &mut [[u8; L]]) {
     for (g, columns) in columns.chunks_exact_mut(codes.len()).enumerate() {
         for (column, code) in columns.iter_mut().zip(codes) {
             for (c, one) in column.iter_mut().zip(counts(order, g, *code)) {
-                *c = c.wrapping_add(one.wrapping_mul(by));
+                *c = c.wrapping_sub(one);
             }
         }
     }

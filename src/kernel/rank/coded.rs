@@ -6,7 +6,7 @@
 use super::buckets::{self, Buckets};
 use super::{Key, Plan, ToKey, gone};
 use crate::brick::scratch::{cut, padded};
-use crate::grid::{Shape, View, ViewMut};
+use crate::grid::{DType, Shape, View, ViewMut};
 use crate::kernel::levels::sums::{NEVER, Row, Sum, Tile, Work, sweep};
 use crate::kernel::simd::Level;
 use crate::multiversion;
@@ -89,9 +89,18 @@ pub(super) fn scratch_bytes<K: Index>(plan: &Plan) -> usize {
     padded::<u8>(K::KEYS) + padded::<u8>(tile.codes()) + counts + buckets
 }
 
-/// Whether windows can be counted this way: their planes fit in a byte.
-pub(super) fn serves(plan: &Plan) -> bool {
-    plan.reach.is_empty() && (2 * plan.radius[0] + 1).min(plan.src[0]) <= usize::from(u8::MAX)
+/// Voxels of a window from which this way is the faster one: for 8 bits at radius 5 (1331 voxels), comparing takes 18.7 ns
+/// per voxel; for 16 bits with many values at radius 10 (9261 voxels), comparing takes 166 and this 217, at radius 64 this
+/// takes 2.3 us and comparing ten times that (2-core Zen 4 VM, AVX-512, 2026-11-26).
+const FROM: [usize; 2] = [1500, 15_000];
+
+/// Whether windows are counted this way: their planes fit in a byte, and there are enough voxels.
+pub(super) fn serves(plan: &Plan, dtype: DType) -> bool {
+    let window = plan.radius.map(|r| 2 * r + 1);
+    let from = FROM[usize::from(dtype.size() > 1)];
+    plan.reach.is_empty()
+        && window[0].min(plan.src[0]) <= usize::from(u8::MAX)
+        && window.iter().product::<usize>() > from
 }
 
 /// Writes the openness of every voxel.

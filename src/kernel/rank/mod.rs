@@ -44,7 +44,7 @@ pub fn rank(
             count_all::<_, $key, $lanes>(cx.level, $view, missing, flipped, &plan, bytes, dst)
         }};
     }
-    if let (true, AnyViewMut::F32(dst)) = (coded::serves(&plan), &mut dst) {
+    if let (true, AnyViewMut::F32(dst)) = (coded::serves(&plan, src.dtype()), &mut dst) {
         macro_rules! coded {
             ($view:expr, $key:ty) => {{
                 let source = coded::Source { view: $view, missing: missing_as(params.missing), flipped };

@@ -164,3 +164,59 @@ fn a_ball_is_decided_in_integers() {
     assert_eq!(ball([0, 1, 2], [0, 1, 2]), [Some(0), Some(2), Some(0)]);
     assert_eq!(ball([usize::MAX, 0, 0], [1, 0, 0]), [Some(0), Some(0), Some(0)]);
 }
+
+/// The coded kernel itself, whatever the size of the window.
+fn coded_openness<T: ToKey<K>, K: coded::Index>(v: View<T>, p: &WindowParams, ties: Ties, level: Level) -> Vec<f64> {
+    let plan = Plan::new(v.shape, v.shape, [0; 3], p.radius, WindowShape::Box, ties);
+    let mut scratch = Scratch::new();
+    let bytes = scratch.take(coded::scratch_bytes::<K>(&plan));
+    bytes.fill(0xa5);
+    let mut out = vec![7f32; v.data.len()];
+    let source = coded::Source { view: v, missing: missing_as(p.missing), flipped: p.flipped() };
+    let dst = &mut crate::grid::ViewMut::dense(&mut out, v.shape);
+    coded::count_all::<T, K>(level, &source, &plan, bytes, dst);
+    out.into_iter().map(f64::from).collect()
+}
+
+#[test]
+fn thresholds_and_buckets_count_as_the_definition_says() {
+    let radii = [[1, 1, 1], [2, 3, 1], [0, 2, 4], [3, 0, 0], [0, 0, 0], [3, 5, 200]];
+    for (s, shape) in [[1, 1, 1], [7, 1, 9], [9, 11, 37], [70, 3, 5], [2, 70, 67], [5, 6, 140]].into_iter().enumerate()
+    {
+        let few = volume(DType::U8, shape, s as u64);
+        let mut noise = crate::kernel::hostile::Noise(s as u64);
+        // More values than thresholds, a few of them often.
+        let n = shape.iter().product();
+        let many: Vec<u16> = (0..n).map(|_| if noise.below(4) == 0 { 5 } else { noise.next() as u16 }).collect();
+        for (r, radius) in radii.into_iter().enumerate() {
+            let p = params(radius, [Some(5), None, Some(12)][(r + s) % 3], (r + s) % 2 == 1);
+            for (ties, level) in
+                [Ties::Le, Ties::Mid].into_iter().flat_map(|t| Level::available().into_iter().map(move |l| (t, l)))
+            {
+                let expect = reference(&few, shape, &p, WindowShape::Box, ties);
+                let Voxels::U8(v) = &few else { unreachable!() };
+                let got = coded_openness::<u8, i8>(View::dense(v, shape), &p, ties, level);
+                same(&got, &expect, &format!("u8 {shape:?} {p:?} {ties:?} {level:?}"));
+                let expect = reference(&Voxels::U16(many.clone()), shape, &p, WindowShape::Box, ties);
+                let got = coded_openness::<u16, i16>(View::dense(&many, shape), &p, ties, level);
+                same(&got, &expect, &format!("u16 {shape:?} {p:?} {ties:?} {level:?}"));
+            }
+        }
+    }
+}
+
+#[test]
+fn all_256_values_of_a_byte_are_thresholds() {
+    let shape = [8, 16, 40];
+    let v: Vec<u8> = (0..8 * 16 * 40).map(|i: usize| (i * 37 % 256) as u8).collect();
+    for (missing, low) in [(None, false), (Some(0), false), (Some(255), true), (Some(100), false)] {
+        let p = params([2, 3, 9], missing, low);
+        for ties in [Ties::Le, Ties::Mid] {
+            let expect = reference(&Voxels::U8(v.clone()), shape, &p, WindowShape::Box, ties);
+            for level in Level::available() {
+                let got = coded_openness::<u8, i8>(View::dense(&v, shape), &p, ties, level);
+                same(&got, &expect, &format!("{missing:?} {low} {ties:?} {level:?}"));
+            }
+        }
+    }
+}

@@ -28,7 +28,9 @@ impl Needs {
                 WindowChannel::Variance | WindowChannel::Std | WindowChannel::Moment2 => {
                     (needs.mean, needs.variance) = (true, true)
                 }
-                WindowChannel::Openness(Method::Exact, _) => panic!("exact openness has a kernel of its own"),
+                WindowChannel::Openness(Method::Exact | Method::Levels, _) => {
+                    panic!("openness by counting has kernels of its own")
+                }
                 WindowChannel::Openness(Method::CdfPower, _) => (needs.extremes, needs.mean) = (true, true),
                 WindowChannel::Openness(Method::Beta, _) => {
                     (needs.extremes, needs.mean, needs.variance) = (true, true, true)
