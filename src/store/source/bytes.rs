@@ -4,8 +4,6 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-#[cfg(target_os = "linux")]
-use memmap2::Advice;
 use memmap2::{Mmap, UncheckedAdvice};
 
 use crate::brick::Voxels;
@@ -31,11 +29,6 @@ impl MappedFile {
         // bytes are merely other voxels, and `bytes` asks for the length before each use, so that a shortened file
         // becomes an error (one that shrinks in the very moment of a read is the one case left).
         let map = unsafe { Mmap::map(&file) }.map_err(|e| Error::file(path, format!("cannot be mapped: {e}")))?;
-        // A file that was just written in large pieces lies in the page cache in pieces of up to 2 MiB, and recent kernels
-        // map a whole one where a byte of it is read: a brick's rows then hold all planes, far beyond the budget. Only a
-        // hint: kernels without such pages refuse it.
-        #[cfg(target_os = "linux")]
-        let _ = map.advise(Advice::NoHugePage);
         Ok(MappedFile { path: path.to_path_buf(), file, map })
     }
 

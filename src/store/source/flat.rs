@@ -22,6 +22,10 @@ const STACK: usize = 128;
 /// Share of the budget that decoded chunks may be counted on to get beside bricks and open shards.
 const CACHE_SHARE: u64 = 8;
 
+/// Bytes written at a time: recent kernels keep what one call wrote in one large page, and map all of it into this process
+/// where a byte of it is read.
+const PIECE: usize = 1 << 16;
+
 /// Bytes of all voxels, all components.
 pub fn bytes(info: &VolumeInfo) -> u64 {
     (info.voxels() as u64).saturating_mul((info.components * info.dtype.size()) as u64)
@@ -86,7 +90,9 @@ fn put(file: &File, base: u64, info: &VolumeInfo, chunk: Shape, cell: Region, by
         for y in 0..runs {
             let from = (z * chunk[1] + y) * chunk[2] * size;
             let at = ((cell.lo[0] as usize + z) * height + cell.lo[1] as usize + y) * width + cell.lo[2] as usize;
-            file.write_all_at(&bytes[from..from + rows * nx * size], base + (at * size) as u64)?;
+            for (i, piece) in bytes[from..from + rows * nx * size].chunks(PIECE).enumerate() {
+                file.write_all_at(piece, base + (at * size + i * PIECE) as u64)?;
+            }
         }
     }
     Ok(())
