@@ -13,6 +13,8 @@ pub struct BrickChoice {
     pub shape: Shape,
     /// Bytes that one brick keeps alive.
     pub bytes: u64,
+    /// Bytes of scratch of each worker that computes one.
+    pub scratch: u64,
     /// Bricks alive at once.
     pub in_flight: usize,
     /// Bytes for decoded chunks.
@@ -27,11 +29,12 @@ pub struct BrickChoice {
 impl BrickChoice {
     /// Worst case by formula.
     pub fn peak(&self, workers: usize) -> u64 {
-        memory::FIXED
-            + memory::PER_THREAD * workers as u64
-            + self.parked
-            + self.bytes * self.in_flight as u64
-            + self.cache
+        memory::FIXED + memory::PER_THREAD * workers as u64 + self.parked + self.alive(workers) + self.cache
+    }
+
+    /// Bytes of all bricks in flight and of the workers' scratch.
+    pub fn alive(&self, workers: usize) -> u64 {
+        self.bytes * self.in_flight as u64 + self.scratch * self.in_flight.min(workers) as u64
     }
 }
 
@@ -125,12 +128,13 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
     let parked = parked_bytes(plan, &probe);
     let fixed = memory::FIXED + memory::PER_THREAD * plan.workers as u64;
     let room = plan.memory.checked_sub(fixed + parked)?;
-    let in_flight = (room / bytes.max(1)).min(memory::in_flight(plan.workers) as u64) as usize;
-    if in_flight == 0 {
-        return None;
-    }
-    let cache = memory::cache_bytes(plan, bytes, in_flight as u64, parked);
-    Some(BrickChoice { shape, bytes, in_flight, cache, parked, amplification: amplification(plan, group, shape), why })
+    let mut choice = BrickChoice { shape, bytes, parked, why, ..BrickChoice::default() };
+    choice.scratch = memory::scratch_bytes(plan, group, shape);
+    let fits = |n: &usize| BrickChoice { in_flight: *n, ..choice.clone() }.alive(plan.workers) <= room;
+    choice.in_flight = (1..=memory::in_flight(plan.workers)).rev().find(fits)?;
+    choice.cache = memory::cache_bytes(plan, choice.alive(plan.workers), parked);
+    choice.amplification = amplification(plan, group, shape);
+    Some(choice)
 }
 
 /// Input voxels read per output voxel, the mean over the group's inputs, halos clipped to the volume.
@@ -167,7 +171,7 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
 }
 
 fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
-    let bytes = brick_bytes(plan, group, shape);
+    let bytes = brick_bytes(plan, group, shape) + memory::scratch_bytes(plan, group, shape);
     let mut probe = group.clone();
     probe.brick.shape = shape;
     let need = bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.workers as u64;

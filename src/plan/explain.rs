@@ -75,19 +75,20 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
     let _ = writeln!(w, "brick {:?} voxels (z, y, x): {}", brick.shape, brick.why);
     let _ = writeln!(
         w,
-        "  {} bricks in {} tasks of up to {:?}; {} each, {} in flight",
+        "  {} bricks in {} tasks of up to {:?}; {} each, {} in flight; {} of scratch per worker",
         group.brick_count(),
         group.task_count(),
         group.task,
         mib(brick.bytes),
-        brick.in_flight
+        brick.in_flight,
+        mib(brick.scratch)
     );
     let _ = writeln!(
         w,
         "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {})",
         mib(brick.peak(plan.workers)),
         mib(plan.memory),
-        mib(brick.bytes * brick.in_flight as u64),
+        mib(brick.alive(plan.workers)),
         mib(brick.cache),
         mib(brick.parked)
     );
@@ -203,7 +204,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
             json!({
                 "skippable": skips_json(g, known.as_ref()),
                 "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
-                "brick_bytes": g.brick.bytes, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
+                "brick_bytes": g.brick.bytes, "scratch_bytes": g.brick.scratch, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
                 "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache,
                 "peak_memory_bytes": g.brick.peak(plan.workers), "read_amplification": g.brick.amplification,
             })

@@ -17,7 +17,8 @@ pub fn wire_box(brick: Region, halo: [usize; 3], volume: Shape) -> Region {
     brick.grow(halo).clip(&Region::whole(volume))
 }
 
-/// Bytes that one brick of `shape` voxels keeps alive at most, from its first read to its last write.
+/// Bytes that one brick of `shape` voxels keeps alive at most, from its first read to its last write, apart from the
+/// scratch of the worker that computes it.
 pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
     let size = |halo: [usize; 3]| grown(shape, halo, group.shape);
     let voxels = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
@@ -31,8 +32,7 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
     for (at, &s) in group.steps.iter().enumerate() {
         let step = &plan.graph.steps[s];
         let outputs: Vec<(WireId, u64)> = step.outputs.iter().map(|&w| (w, wire_bytes(w, step.halo))).collect();
-        let now = sum(&live) + sum(&outputs) + step_scratch(plan, step, shape, group.shape);
-        peak = peak.max(now);
+        peak = peak.max(sum(&live) + sum(&outputs));
         live.extend(outputs);
         let last_use = |w: WireId| {
             group.sinks.contains(&w) || group.steps[at + 1..].iter().any(|&t| reads(&plan.graph.steps[t], w))
@@ -43,6 +43,12 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
     }
     let sinks: u64 = group.outputs.iter().map(|&o| output_bytes(plan, group, &plan.outputs[o], shape)).sum();
     peak.max(sum(&live) + sinks)
+}
+
+/// Bytes that a worker needs besides to compute bricks of `shape`: bricks that wait to be computed or written take none.
+pub fn scratch_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
+    let steps = group.steps.iter().map(|&s| step_scratch(plan, &plan.graph.steps[s], shape, group.shape));
+    steps.max().unwrap_or(0)
 }
 
 fn sum(list: &[(WireId, u64)]) -> u64 {
@@ -196,8 +202,8 @@ pub fn in_flight(threads: usize) -> usize {
     threads + 2
 }
 
-/// Bytes for decoded chunks when `bricks` bricks of `brick` bytes are alive.
-pub fn cache_bytes(plan: &Plan, brick: u64, bricks: u64, parked: u64) -> u64 {
+/// Bytes for decoded chunks beside bricks and scratch of `bricks` bytes.
+pub fn cache_bytes(plan: &Plan, bricks: u64, parked: u64) -> u64 {
     let fixed = FIXED + PER_THREAD * plan.workers as u64;
-    plan.memory.saturating_sub(fixed + parked + brick * bricks)
+    plan.memory.saturating_sub(fixed + parked + bricks)
 }

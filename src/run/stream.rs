@@ -74,7 +74,9 @@ impl<W: Send> Stream<'_, W> {
         let first = FirstError::default();
         let budget = Budget::new(self.budget);
         let queue = Queue { next: Mutex::new(0), work: self.work };
-        let scratches: Vec<Mutex<Scratch>> = (0..self.threads).map(|_| Mutex::new(Scratch::new())).collect();
+        // As many as the plan counts: scratch stays allocated between bricks.
+        let at_once = (self.budget / self.brick_bytes.max(1)).clamp(1, self.threads as u64);
+        let scratches: Vec<Mutex<Scratch>> = (0..at_once).map(|_| Mutex::new(Scratch::new())).collect();
         let (to_compute, ready) = crossbeam_channel::bounded::<(Work, Loaded, Permit)>(self.threads);
         let (to_write, finished) = crossbeam_channel::bounded::<(Work, W, Permit)>(self.threads + 1);
         std::thread::scope(|scope| {
@@ -154,7 +156,9 @@ impl<W: Send> Stream<'_, W> {
         }
         let worker = rayon::current_thread_index().unwrap_or(0);
         let _span = tracing::debug_span!("brick", region = ?work.brick, worker).entered();
-        let mut scratch = scratches[worker].lock().unwrap_or_else(|e| e.into_inner());
+        let free = scratches.iter().find_map(|s| s.try_lock().ok());
+        let mine = || scratches[worker % scratches.len()].lock().unwrap_or_else(|e| e.into_inner());
+        let mut scratch = free.unwrap_or_else(mine);
         let result = guarded(|| {
             let engine = self.reader.engine;
             let done = evaluate(engine, self.reader.program, loaded, &mut scratch, self.metrics, self.trace)?;
