@@ -245,7 +245,7 @@ fn count_row_inner<S: Sum, const L: usize>(
         let (columns, code) = (tile.window(2, x), usize::from(*code));
         let n = all.map_or(rows * columns.len() as u32, |k| row.count(&columns, k));
         counts.n[x] = n;
-        counts.low[x] = if code == 0 { 0 } else { row.count(&columns, (code - 1).min(levels - 1)) };
+        counts.low[x] = if code == 0 { 0 } else { row.count(&columns, (code - 1).min(levels.saturating_sub(1))) };
         counts.high[x] = if code < levels { row.count(&columns, code) } else { n };
     }
 }

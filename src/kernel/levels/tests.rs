@@ -173,3 +173,13 @@ fn uniform_noise_gives_its_own_value() {
     let centre = 9261 / 2;
     assert!((got[centre] - v.at(centre)).abs() < 0.02, "{} at {}", got[centre], v.at(centre));
 }
+
+#[test]
+fn a_volume_without_a_finite_voxel_has_no_levels() {
+    let (nan, inf) = (f32::NAN, f32::INFINITY);
+    let v = Voxels::F32(vec![nan, inf, -inf, nan]);
+    let p = params([0, 0, 1], None, false);
+    let got = bricks(&v, [1, 1, 4], &Levels::default(), &p, Ties::Le, 9, Level::detect());
+    assert!(got[0].is_nan() && got[3].is_nan());
+    assert_eq!((got[1], got[2]), (1.0, 0.0));
+}

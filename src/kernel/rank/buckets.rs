@@ -116,7 +116,7 @@ impl<'a> Buckets<'a> {
         let part = |from: usize, to: usize| [0, 1, 2].map(|a| &self.places[a][from..to]);
         let mut less = within(level, part(to, end), low, reach);
         if ties == Ties::Mid {
-            less += less + within(level, part(from, to), low, reach);
+            less = 2 * less + within(level, part(from, to), low, reach);
         }
         self.counted[(at[0] * tile.dst[1] + at[1]) * tile.dst[2] + at[2]] -= less;
     }
