@@ -71,6 +71,13 @@ pub enum Files {
 }
 
 impl Files {
+    /// See [`MappedFile::forget`]; does nothing where no map outlives a read.
+    pub fn forget(&self, index: usize, start: u64, end: u64) {
+        if let Files::Held(files) = self {
+            files[index].forget(start, end);
+        }
+    }
+
     /// Runs `f` on the bytes of file `index`.
     pub fn with_bytes<R>(&self, index: usize, f: impl FnOnce(&[u8]) -> Result<R>) -> Result<R> {
         match self {

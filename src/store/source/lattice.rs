@@ -27,6 +27,10 @@ pub enum Planes {
     Table(Vec<(u32, u64)>),
 }
 
+/// Bytes of a mapped file that a reader may leave resident: a file that was just written can lie in the page cache in pieces
+/// of megabytes, and a touch then maps the whole piece, so a box of many planes maps most of the file.
+const MAPPED: u64 = 16 << 20;
+
 impl Lattice {
     /// One component, densely packed from byte `base` of one file on. `None` where the sizes overflow.
     pub fn dense(shape: Shape, dtype: DType, big_endian: bool, base: u64) -> Option<Lattice> {
@@ -90,8 +94,20 @@ impl Lattice {
         let size = self.dtype.size() as u64;
         let offset = region.lo[1] as u64 * self.row + region.lo[2] as u64 * self.step;
         let swap = self.big_endian != cfg!(target_endian = "big");
+        let span = self.plane_span().unwrap_or(0);
+        // The file and its bytes that the planes since the last release lie in.
+        let mut front: Option<(usize, u64, u64)> = None;
         for z in region.lo[0]..region.hi[0] {
             let (file, start) = self.plane_at(component, z as usize);
+            front = match front {
+                Some((f, lo, hi)) if f == file && hi.max(start + span) - lo.min(start) <= MAPPED => {
+                    Some((f, lo.min(start), hi.max(start + span)))
+                }
+                behind => {
+                    behind.into_iter().for_each(|(f, lo, hi)| files.forget(f, lo, hi));
+                    Some((file, start, start + span))
+                }
+            };
             let from = (start + offset) as usize;
             let into = (z - region.lo[0]) as usize;
             files.with_bytes(file, |bytes| {
@@ -100,6 +116,7 @@ impl Lattice {
                 Ok(())
             })?;
         }
+        front.into_iter().for_each(|(f, lo, hi)| files.forget(f, lo, hi));
         Ok(region.voxels() as u64 * size)
     }
 
