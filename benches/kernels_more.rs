@@ -169,7 +169,8 @@ fn levels_job<'a>(dtype: DType, count: usize, radius: usize) -> Job<'a> {
             let place = |i: usize| {
                 [i / src.shape()[2] / src.shape()[1], i / src.shape()[2] % src.shape()[1], i % src.shape()[2]]
             };
-            let mut values: Vec<f64> = (0..n).step_by(97).map(|i| src.at(place(i))).collect();
+            let mut values: Vec<f64> =
+                (0..n).step_by(97).map(|i| occlude::with_view!(AnyView, src, v => v.at(place(i)).to_f64())).collect();
             values.sort_by(f64::total_cmp);
             let groups = values.chunk_by(|a, b| a == b).map(|g| (g[0], g.len() as u64));
             Levels::choose(&groups.collect::<Vec<_>>(), count)
