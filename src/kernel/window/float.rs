@@ -142,7 +142,7 @@ pub fn run<T: Float>(
                     extremes.planes(level, job, &tile, j, &lines);
                 }
                 if let Some(sums) = sums.as_mut().filter(|_| exists) {
-                    sums.planes(level, wanted, job, j, &lines);
+                    sums.planes(level, wanted, job, z0, j, &lines);
                 }
             }
             for z in z0.max(job.skip[0])..(z0 + job.batch).min(job.dst[0]) {
@@ -383,7 +383,8 @@ impl<'a, A: Sum> Buffers<'a, A> {
 
     /// Weights and counts along an axis for outputs from `start` on.
     fn aim(&mut self, job: &Job, a: usize, start: usize) {
-        let axis = job.axis(a, start, Self::outputs(job)[a] / BLOCK);
+        let outputs = Self::outputs(job)[a].min(job.dst[a] - start);
+        let axis = job.axis(a, start, outputs.div_ceil(BLOCK));
         self.weights[a].fill(axis);
         self.counts[a].iter_mut().enumerate().for_each(|(k, n)| *n = axis.count(k));
     }
@@ -409,12 +410,21 @@ impl<'a, A: Sum> Buffers<'a, A> {
     }
 
     /// Over z, buffer row `j` of all planes of a batch.
-    fn planes<T: Float<Total = A>>(&mut self, level: Level, wanted: Wanted, job: &Job, j: usize, lines: &Lines<T>) {
+    #[allow(clippy::too_many_arguments)]
+    fn planes<T: Float<Total = A>>(
+        &mut self,
+        level: Level,
+        wanted: Wanted,
+        job: &Job,
+        z0: usize,
+        j: usize,
+        lines: &Lines<T>,
+    ) {
         let pass = Pass {
             lines: Held::default(),
             pitch: lines.pitch,
             window: job.window[0],
-            blocks: 0..job.batch / BLOCK,
+            blocks: 0..job.batch.min(job.dst[0] - z0).div_ceil(BLOCK),
             columns: width(job),
             weights: &self.weights[0],
             counts: &*self.counts[0],

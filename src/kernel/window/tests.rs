@@ -278,6 +278,14 @@ fn wide_sums_of_long_windows() {
     }
 }
 
+#[test]
+fn long_float_windows_in_short_last_tiles() {
+    let shape = [3, 9, 530]; // three tiles along x, the last of 18 voxels
+    for dtype in [DType::F32, DType::F64] {
+        check("short tile", &noisy(dtype, shape, 43), shape, &params([1, 2, 64]), 401);
+    }
+}
+
 /// Bits of every channel must not depend on the brick.
 fn check_bricks(volume: &Voxels, shape: Shape, p: &WindowParams, cuts: [usize; 3]) {
     let channels = all_channels();
