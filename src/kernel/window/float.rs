@@ -1,8 +1,8 @@
 //! Float volumes: extremes exactly, sums and merges of (sum, M2) in an order that depends on the window and its place in
 //! the volume alone, so that neither the brick nor a NaN elsewhere in it shows in a single bit.
 //!
-//! Per tile and batch of planes: z leaves planes of cells, y leaves lines of x that hold
-//! eight rows each, x leaves rows ([`super::moments`]).
+//! Per tile and batch of planes: z leaves planes of cells, y leaves lines of x that hold eight rows each, x leaves rows
+//! ([`super::moments`]).
 
 use super::along::SLACK;
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
