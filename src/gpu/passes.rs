@@ -80,13 +80,7 @@ pub struct Part {
 impl Job {
     /// `None` if voxels of this type have no kernel here, or the windows could hold 2^31 voxels.
     pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], radius: [usize; 3], needs: Needs) -> Option<Job> {
-        let (voxel, signed) = match dtype {
-            DType::U8 => (1, false),
-            DType::I8 => (1, true),
-            DType::U16 => (2, false),
-            DType::I16 => (2, true),
-            _ => return None,
-        };
+        let (voxel, signed) = packed(dtype)?;
         let radius = std::array::from_fn(|a| radius[a].min(src[a].saturating_sub(1)));
         let job = Job { src, dst, at, radius, voxel, signed, needs };
         (job.count() < 1 << 31).then_some(job)
@@ -116,9 +110,7 @@ impl Job {
     }
 
     fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
-        let from: [usize; 3] = std::array::from_fn(|a| (self.at[a] + lo[a]).saturating_sub(self.radius[a]));
-        let to = |a: usize| (self.at[a] + lo[a] + dst[a] + self.radius[a]).min(self.src[a]);
-        Part { lo, dst, from, src: std::array::from_fn(|a| to(a) - from[a]) }
+        Part::around(self.src, self.at, self.radius, lo, dst)
     }
 
     /// Voxels per packed row, a whole number of words.
@@ -218,6 +210,27 @@ impl Job {
             to += bytes.next_multiple_of(256);
         }
         Recording { sizes: self.sizes(part), tables: Vec::new(), commands }
+    }
+}
+
+impl Part {
+    /// The outputs `lo..lo + dst` of a call, and what windows of this radius see of its source.
+    pub fn around(src: Shape, at: [usize; 3], radius: [usize; 3], lo: [usize; 3], dst: Shape) -> Part {
+        let from: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a]).saturating_sub(radius[a]));
+        let to = |a: usize| (at[a] + lo[a] + dst[a] + radius[a]).min(src[a]);
+        Part { lo, dst, from, src: std::array::from_fn(|a| to(a) - from[a]) }
+    }
+}
+
+/// Bytes of a voxel that is uploaded as it is stored, and whether it is two's complement; `None` for types without kernels
+/// that read them so.
+pub fn packed(dtype: DType) -> Option<(usize, bool)> {
+    match dtype {
+        DType::U8 => Some((1, false)),
+        DType::I8 => Some((1, true)),
+        DType::U16 => Some((2, false)),
+        DType::I16 => Some((2, true)),
+        _ => None,
     }
 }
 

@@ -1,7 +1,7 @@
 //! Gaussian means: how a brick is cut into parts that fit the device, the table of weights, and one pass per axis. Pure
 //! arithmetic, shared by planner and engine.
 
-use super::passes::{Part, cut};
+use super::passes::{Part, cut, packed};
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Shape};
 use crate::kernel::gaussian;
@@ -44,20 +44,12 @@ pub struct TapsJob {
 impl TapsJob {
     /// `None` if voxels of this type have no kernel here.
     pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], sigma: [f64; 3]) -> Option<TapsJob> {
-        let (voxel, signed) = match dtype {
-            DType::U8 => (1, false),
-            DType::I8 => (1, true),
-            DType::U16 => (2, false),
-            DType::I16 => (2, true),
-            _ => return None,
-        };
+        let (voxel, signed) = packed(dtype)?;
         Some(TapsJob { src, dst, at, sigma, radius: gaussian::shared::radius(sigma, src), voxel, signed })
     }
 
     fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
-        let from: [usize; 3] = std::array::from_fn(|a| (self.at[a] + lo[a]).saturating_sub(self.radius[a]));
-        let to = |a: usize| (self.at[a] + lo[a] + dst[a] + self.radius[a]).min(self.src[a]);
-        Part { lo, dst, from, src: std::array::from_fn(|a| to(a) - from[a]) }
+        Part::around(self.src, self.at, self.radius, lo, dst)
     }
 
     /// Voxels per packed row, a whole number of words.

@@ -4,6 +4,8 @@
 //! Per tile and batch of planes: z leaves planes of cells, y leaves lines of x that hold eight rows each, x leaves rows
 //! ([`super::moments`]).
 
+use std::ops::Range;
+
 use super::along::SLACK;
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
 use super::extremes::{blocked, deep_len, rows_extremes};
@@ -42,7 +44,8 @@ pub fn bytes<T: Float>(job: &Job) -> usize {
 }
 
 /// The lines along z of one buffer row of a batch, side by side: planes lie a power of two apart in many volumes, and then
-/// few cache sets hold all of a column, which extremes and sums both read.
+/// few cache sets hold all of a column, which extremes and sums both read. 2-core Zen 4 VM, AVX-512, 2026-11-23, 256 x 256
+/// planes, cdf_power r=10 of f32: 12.9 ns/voxel in place, 11.4 and 10.0 staged, in runs of their own on a busy machine.
 struct Lines<'a, T> {
     buffer: &'a mut [T],
     pitch: usize,
@@ -191,6 +194,18 @@ fn corners(job: &Job) -> impl Iterator<Item = (usize, usize)> + '_ {
     planes.flat_map(|z| (0..job.dst[1]).step_by(job.tile[0]).map(move |y| (z, y)))
 }
 
+/// The last `kept` rows of the buffer of the tile above, in the plane at `plane`; they become the first of this tile's.
+fn made_above(job: &Job, kept: usize, plane: usize) -> Range<usize> {
+    plane + job.tile[0] * job.pitch..plane + (job.tile[0] + kept) * job.pitch
+}
+
+/// Rows after the kept ones that do not exist, as elements of the plane at `plane`.
+fn empty_rows(job: &Job, tile: &Tile, kept: usize, plane: usize) -> impl Iterator<Item = Range<usize>> {
+    let pitch = job.pitch;
+    let rows = [kept..tile.rows.0, tile.rows.1.max(kept)..job.height];
+    rows.into_iter().filter(|r| r.start < r.end).map(move |r| plane + r.start * pitch..plane + r.end * pitch)
+}
+
 /// Finished windows of one row.
 struct Row<'a, T: Float> {
     v: &'a [T],
@@ -288,15 +303,12 @@ impl<'a, T: Float> Extremes<'a, T> {
     /// Moves rows that the tile above has made; rows that do not exist are neutral.
     fn keep(&mut self, job: &Job, tile: &Tile, kept: usize) {
         for plane in (0..self.lo.len()).step_by(job.plane()) {
-            let from = plane + job.tile[0] * job.pitch..plane + (job.tile[0] + kept) * job.pitch;
-            self.lo.copy_within(from.clone(), plane);
-            self.hi.copy_within(from, plane);
-            for rows in [kept..tile.rows.0, tile.rows.1.max(kept)..job.height] {
-                if rows.start < rows.end {
-                    let gap = plane + rows.start * job.pitch..plane + rows.end * job.pitch;
-                    self.lo[gap.clone()].fill(T::GREATEST);
-                    self.hi[gap].fill(T::LEAST);
-                }
+            let above = made_above(job, kept, plane);
+            self.lo.copy_within(above.clone(), plane);
+            self.hi.copy_within(above, plane);
+            for gap in empty_rows(job, tile, kept, plane) {
+                self.lo[gap.clone()].fill(T::GREATEST);
+                self.hi[gap].fill(T::LEAST);
             }
         }
     }
@@ -399,12 +411,9 @@ impl<'a, A: Sum> Buffers<'a, A> {
         }
         self.aim(job, 1, tile.y);
         for plane in (0..self.planes.s.len()).step_by(job.plane()) {
-            let from = plane + job.tile[0] * job.pitch..plane + (job.tile[0] + kept) * job.pitch;
-            self.planes.copy_within(from, plane);
-            for rows in [kept..tile.rows.0, tile.rows.1.max(kept)..job.height] {
-                if rows.start < rows.end {
-                    self.planes.part(plane + rows.start * job.pitch..plane + rows.end * job.pitch).clear();
-                }
+            self.planes.copy_within(made_above(job, kept, plane), plane);
+            for gap in empty_rows(job, tile, kept, plane) {
+                self.planes.part(gap).clear();
             }
         }
     }
