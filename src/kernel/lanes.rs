@@ -174,7 +174,9 @@ mod x86 {
         #[inline(always)]
         fn present(self) -> [Self; 2] {
             let there = unsafe { _mm512_cmp_pd_mask::<_CMP_ORD_Q>(self.0, self.0) };
-            [self.0, unsafe { _mm512_set1_pd(1.0) }].map(|v| Avx512(unsafe { _mm512_maskz_mov_pd(there, v) }))
+            unsafe {
+                [Avx512(_mm512_maskz_mov_pd(there, self.0)), Avx512(_mm512_maskz_mov_pd(there, _mm512_set1_pd(1.0)))]
+            }
         }
         /// Three rounds, each of which rotates the address of a value (3 bits of row, 3 of column) by one.
         #[inline(always)]
@@ -194,10 +196,37 @@ mod x86 {
         }
     }
 
-    impl Avx2 {
-        #[inline(always)]
-        fn zip(self, o: Avx2, f: impl Fn(__m256d, __m256d) -> __m256d) -> Avx2 {
-            Avx2([f(self.0[0], o.0[0]), f(self.0[1], o.0[1])])
+    /// An operation on both halves. Macros and functions, never closures: the compiler must inline all of it.
+    macro_rules! halves {
+        ($op:ident, $($operand:expr),*) => {
+            unsafe { Avx2([$op($($operand.0[0]),*), $op($($operand.0[1]),*)]) }
+        };
+    }
+
+    #[inline(always)]
+    unsafe fn positive(v: __m256d, sign: __m256d) -> __m256d {
+        unsafe { _mm256_and_pd(v, _mm256_cmp_pd::<_CMP_GT_OQ>(sign, _mm256_setzero_pd())) }
+    }
+
+    #[inline(always)]
+    unsafe fn ordered(v: __m256d, with: __m256d) -> __m256d {
+        unsafe { _mm256_and_pd(v, _mm256_cmp_pd::<_CMP_ORD_Q>(with, with)) }
+    }
+
+    /// Transposes half `half` of four rows.
+    #[inline(always)]
+    unsafe fn quarter(rows: &[Avx2; 8], row: usize, half: usize) -> [__m256d; 4] {
+        unsafe {
+            let [p, q] = [rows[row].0[half], rows[row + 1].0[half]];
+            let [r, s] = [rows[row + 2].0[half], rows[row + 3].0[half]];
+            let (a, b) = (_mm256_unpacklo_pd(p, q), _mm256_unpackhi_pd(p, q));
+            let (c, d) = (_mm256_unpacklo_pd(r, s), _mm256_unpackhi_pd(r, s));
+            [
+                _mm256_permute2f128_pd::<0x20>(a, c),
+                _mm256_permute2f128_pd::<0x20>(b, d),
+                _mm256_permute2f128_pd::<0x31>(a, c),
+                _mm256_permute2f128_pd::<0x31>(b, d),
+            ]
         }
     }
 
@@ -223,53 +252,46 @@ mod x86 {
         }
         #[inline(always)]
         fn plus(self, o: Self) -> Self {
-            self.zip(o, |a, b| unsafe { _mm256_add_pd(a, b) })
+            halves!(_mm256_add_pd, self, o)
         }
         #[inline(always)]
         fn minus(self, o: Self) -> Self {
-            self.zip(o, |a, b| unsafe { _mm256_sub_pd(a, b) })
+            halves!(_mm256_sub_pd, self, o)
         }
         #[inline(always)]
         fn times(self, o: Self) -> Self {
-            self.zip(o, |a, b| unsafe { _mm256_mul_pd(a, b) })
+            halves!(_mm256_mul_pd, self, o)
         }
         #[inline(always)]
         fn over(self, o: Self) -> Self {
-            self.zip(o, |a, b| unsafe { _mm256_div_pd(a, b) })
+            halves!(_mm256_div_pd, self, o)
         }
         #[inline(always)]
         fn fused(self, b: Self, c: Self) -> Self {
-            Avx2(std::array::from_fn(|i| unsafe { _mm256_fmadd_pd(self.0[i], b.0[i], c.0[i]) }))
+            halves!(_mm256_fmadd_pd, self, b, c)
         }
         #[inline(always)]
         fn less(self, b: Self, c: Self) -> Self {
-            Avx2(std::array::from_fn(|i| unsafe { _mm256_fnmadd_pd(self.0[i], b.0[i], c.0[i]) }))
+            halves!(_mm256_fnmadd_pd, self, b, c)
         }
         #[inline(always)]
         fn where_positive(self, sign: Self) -> Self {
-            self.zip(sign, |v, s| unsafe { _mm256_and_pd(v, _mm256_cmp_pd::<_CMP_GT_OQ>(s, _mm256_setzero_pd())) })
+            halves!(positive, self, sign)
         }
         #[inline(always)]
         fn present(self) -> [Self; 2] {
-            let pick = |v: Avx2| self.zip(v, |s, v| unsafe { _mm256_and_pd(v, _mm256_cmp_pd::<_CMP_ORD_Q>(s, s)) });
-            [pick(self), pick(Self::splat(1.0))]
+            let one = Self::splat(1.0);
+            [halves!(ordered, self, self), halves!(ordered, one, self)]
         }
         /// Four blocks of 4 x 4.
         #[inline(always)]
         fn turn(rows: [Self; 8]) -> [Self; 8] {
-            let block = |r: [__m256d; 4]| unsafe {
-                let (a, b) = (_mm256_unpacklo_pd(r[0], r[1]), _mm256_unpackhi_pd(r[0], r[1]));
-                let (c, d) = (_mm256_unpacklo_pd(r[2], r[3]), _mm256_unpackhi_pd(r[2], r[3]));
-                [
-                    _mm256_permute2f128_pd::<0x20>(a, c),
-                    _mm256_permute2f128_pd::<0x20>(b, d),
-                    _mm256_permute2f128_pd::<0x31>(a, c),
-                    _mm256_permute2f128_pd::<0x31>(b, d),
-                ]
-            };
-            let part = |row: usize, half: usize| block(std::array::from_fn(|i| rows[row + i].0[half]));
-            let halves = [[part(0, 0), part(4, 0)], [part(0, 1), part(4, 1)]];
-            std::array::from_fn(|i| Avx2([halves[i / 4][0][i % 4], halves[i / 4][1][i % 4]]))
+            let rows = &rows;
+            let [a, b, c, d] =
+                unsafe { [quarter(rows, 0, 0), quarter(rows, 4, 0), quarter(rows, 0, 1), quarter(rows, 4, 1)] };
+            let [e, f, g, h] = [[a[0], b[0]], [a[1], b[1]], [a[2], b[2]], [a[3], b[3]]];
+            let [i, j, k, l] = [[c[0], d[0]], [c[1], d[1]], [c[2], d[2]], [c[3], d[3]]];
+            [Avx2(e), Avx2(f), Avx2(g), Avx2(h), Avx2(i), Avx2(j), Avx2(k), Avx2(l)]
         }
     }
 }
