@@ -300,16 +300,25 @@ mod x86 {
 /// that level, as [`crate::multiversion`] does for plain loops.
 #[macro_export]
 macro_rules! on_lanes {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident [$($gen:tt)*] ($($arg:ident : $ty:ty),* $(,)?) = $inner:ident [$($pass:tt)*];) => {
+    ($($what:tt)*) => { $crate::on_vectors! { lanes $($what)* } };
+}
+
+/// [`crate::on_lanes`] for the implementations (`Plain`, `Avx2`, `Avx512`) of a module of `kernel`.
+#[macro_export]
+macro_rules! on_vectors {
+    ($module:ident $(#[$meta:meta])* $vis:vis fn $name:ident [$($gen:tt)*] ($($arg:ident : $ty:ty),* $(,)?) = $inner:ident [$($pass:tt)*];) => {
         $(#[$meta])*
+        #[allow(clippy::too_many_arguments)]
         $vis fn $name<$($gen)*>(level: $crate::kernel::simd::Level, $($arg: $ty),*) {
             #[cfg(target_arch = "x86_64")]
             {
-                use $crate::kernel::{lanes, simd::Level};
+                use $crate::kernel::{$module, simd::Level};
                 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512vbmi,avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
-                fn avx512<$($gen)*>($($arg: $ty),*) { $inner::<lanes::Avx512, $($pass)*>($($arg),*) }
+                #[allow(clippy::too_many_arguments)]
+                fn avx512<$($gen)*>($($arg: $ty),*) { $inner::<$module::Avx512, $($pass)*>($($arg),*) }
                 #[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
-                fn avx2<$($gen)*>($($arg: $ty),*) { $inner::<lanes::Avx2, $($pass)*>($($arg),*) }
+                #[allow(clippy::too_many_arguments)]
+                fn avx2<$($gen)*>($($arg: $ty),*) { $inner::<$module::Avx2, $($pass)*>($($arg),*) }
                 match level {
                     // SAFETY: a `Level` above `Baseline` comes from `detect` or `available`, which asked the CPU.
                     Level::Avx512 => return unsafe { avx512::<$($pass)*>($($arg),*) },
@@ -319,7 +328,7 @@ macro_rules! on_lanes {
                 }
             }
             let _ = level;
-            $inner::<$crate::kernel::lanes::Plain, $($pass)*>($($arg),*)
+            $inner::<$crate::kernel::$module::Plain, $($pass)*>($($arg),*)
         }
     };
 }

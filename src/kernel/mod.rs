@@ -19,6 +19,7 @@ pub mod pointwise;
 pub mod rank;
 pub mod reduce;
 pub mod simd;
+pub mod singles;
 pub mod ssim;
 pub(crate) mod values;
 pub mod window;

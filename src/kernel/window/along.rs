@@ -128,22 +128,36 @@ mod wide {
                 out_lo: &mut [$t],
                 out_hi: &mut [$t],
             ) {
-                // Lane j takes lane j + by of a vector and its right neighbour.
-                let shift = |by: usize| {
-                    let lanes: [$index; $lanes] = std::array::from_fn(|j| (j + by) as $index);
-                    // SAFETY: 64 bytes.
-                    unsafe { _mm512_loadu_si512(lanes.as_ptr().cast()) }
+                // Lane j takes lane j + by of a vector and its right neighbour, as a part of one long ramp says.
+                const RAMP: [$index; 2 * $lanes] = {
+                    let mut ramp = [0; 2 * $lanes];
+                    let mut j = 0;
+                    while j < 2 * $lanes {
+                        ramp[j] = j as $index;
+                        j += 1;
+                    }
+                    ramp
                 };
-                let last = shift(w - (1 << P));
-                let shifts: [__m512i; 6] = std::array::from_fn(|k| shift(if k < P { 1 << k } else { 0 }));
+                macro_rules! shift {
+                    // SAFETY: shifts are less than a vector.
+                    ($by:expr) => { unsafe { _mm512_loadu_si512(RAMP[$by..$by + $lanes].as_ptr().cast()) } };
+                }
+                let last = shift!(w - (1 << P));
+                let mut shifts = [last; 6];
+                for k in 0..P.min(6) {
+                    shifts[k] = shift!(1 << k);
+                }
                 let vectors = n.div_ceil($lanes);
                 // The last window reaches one vector beyond the last result, or two.
                 let start = vectors + 1 + (w > $lanes + 1) as usize;
-                // SAFETY: `start` vectors are less than `roomy(n)` elements, as the caller checked.
-                let at = |s: &[$t], i: usize| unsafe { _mm512_loadu_si512(s.as_ptr().add(i * $lanes).cast()) };
-                let (mut right_lo, mut right_hi) = ([at(lo, start - 1); 7], [at(hi, start - 1); 7]);
+                // A macro, as a closure may be left out of line.
+                macro_rules! at {
+                    // SAFETY: `start` vectors are less than `roomy(n)` elements, as the caller checked.
+                    ($s:ident, $i:expr) => { unsafe { _mm512_loadu_si512($s.as_ptr().add($i * $lanes).cast()) } };
+                }
+                let (mut right_lo, mut right_hi) = ([at!(lo, start - 1); 7], [at!(hi, start - 1); 7]);
                 for i in (0..start).rev() {
-                    let (mut a, mut b) = (at(lo, i), at(hi, i));
+                    let (mut a, mut b) = (at!(lo, i), at!(hi, i));
                     grow!(P, shifts, $min, $permute, a, right_lo; 0 1 2 3 4 5);
                     grow!(P, shifts, $max, $permute, b, right_hi; 0 1 2 3 4 5);
                     let (least, most) = ($min(a, $permute(a, last, right_lo[P])), $max(b, $permute(b, last, right_hi[P])));

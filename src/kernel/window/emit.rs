@@ -3,7 +3,7 @@
 use super::estimate::{self, Acc, Code, Polarity, RowSum, Spread, Width};
 use super::int::Setup;
 use super::plan::{Plain, cut, padded};
-use super::{WindowOut, exact};
+use super::{WindowOut, exact, openness};
 use crate::grid::{Affine, AnyViewMut, Voxel};
 use crate::kernel::simd::Level;
 use crate::stage::{Method, Ties, WindowChannel, WindowParams};
@@ -16,6 +16,10 @@ pub struct IntRow<'a, T, X1, X2> {
     pub s1: &'a [X1],
     pub s2: &'a [X2],
     pub n: &'a [u32],
+    /// 1 / n, rounded.
+    pub inverse: &'a [f64],
+    /// Most voxels in a window.
+    pub most: u64,
     pub width: Width,
 }
 
@@ -69,13 +73,13 @@ impl<'a, 'b> Emit<'a, 'b> {
                 if T::TOP == u32::MAX {
                     exact::variance_row(level, row.s1, row.s2, row.n, &mut self.variance[..len]);
                 } else {
-                    estimate::variance_row(level, &self.numerator[..len], row.n, &mut self.variance[..len]);
+                    estimate::variance_row(level, &self.numerator[..len], row.inverse, &mut self.variance[..len]);
                 }
             }
         }
         if self.wants(|c| matches!(c, WindowChannel::Mean | WindowChannel::Moment2)) {
             let exact = setup.job.counts().0 as u128 * (T::TOP as u128) < 1 << 52;
-            estimate::mean_row(level, row.s1, row.n, offset, exact, &mut self.mean[..len]);
+            estimate::mean_row(level, row.s1, row.n, row.inverse, offset, exact, &mut self.mean[..len]);
         }
         let affine = self.params.affine;
         for i in 0..self.outs.len() {
@@ -84,16 +88,15 @@ impl<'a, 'b> Emit<'a, 'b> {
                 WindowChannel::Openness(method, ties) => {
                     let polarity = polarity(self.params, ties);
                     let (v, flip, n) = (row.v, setup.flip, row.n);
+                    let windows = openness::Row { v, flip, s1: row.s1, n, most: row.most };
                     let numerator = &self.numerator[..len.min(self.numerator.len())];
                     let fill = |out: &mut [f32]| match estimator(method) {
-                        Estimator::Power => {
-                            estimate::cdf_power_row(level, v, flip, row.lo, row.hi, row.s1, n, polarity, out)
-                        }
+                        Estimator::Power => openness::cdf_power_row(level, &windows, row.lo, row.hi, polarity, out),
                         Estimator::Beta => {
                             estimate::beta_row(level, v, flip, row.lo, row.hi, row.s1, n, numerator, polarity, out)
                         }
                         Estimator::Spread(kind) => {
-                            estimate::spread_row(level, kind, v, flip, row.s1, n, numerator, polarity, out)
+                            openness::spread_row(level, kind, &windows, numerator, polarity, out)
                         }
                     };
                     put_openness(level, &mut self.outs[i].dst, at, len, self.open, fill);
@@ -250,12 +253,12 @@ fn put_codes<T: Code + Plain>(
         AnyViewMut::F64(d) if !affine.is_identity() => {
             scale_row(level, codes, offset, affine, &mut d.row_at(z, y)[x..end]);
         }
-        AnyViewMut::U8(d) => uncode(codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
-        AnyViewMut::I8(d) => uncode(codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
-        AnyViewMut::U16(d) => uncode(codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
-        AnyViewMut::I16(d) => uncode(codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
-        AnyViewMut::U32(d) => uncode(codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
-        AnyViewMut::I32(d) => uncode(codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
+        AnyViewMut::U8(d) => uncode_row(level, codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
+        AnyViewMut::I8(d) => uncode_row(level, codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
+        AnyViewMut::U16(d) => uncode_row(level, codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
+        AnyViewMut::I16(d) => uncode_row(level, codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
+        AnyViewMut::U32(d) => uncode_row(level, codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
+        AnyViewMut::I32(d) => uncode_row(level, codes, flip, bits_mut(&mut d.row_at(z, y)[x..end])),
         other => panic!("extremes are not written as {}", other.dtype()),
     }
 }
@@ -271,7 +274,12 @@ fn scale_inner<T: Code, O: Voxel>(codes: &[T], offset: f64, affine: Affine, out:
     }
 }
 
-fn uncode<T: Code>(codes: &[T], flip: T, out: &mut [T]) {
+crate::multiversion! {
+    fn uncode_row[T: Code](codes: &[T], flip: T, out: &mut [T]) -> () = uncode_inner;
+}
+
+#[inline(always)]
+fn uncode_inner<T: Code>(codes: &[T], flip: T, out: &mut [T]) {
     for (o, c) in out.iter_mut().zip(codes) {
         *o = c.code(flip);
     }

@@ -5,6 +5,7 @@ use super::beta::{self, Terms};
 use super::lines::Elem;
 use super::math;
 use crate::kernel::simd::Level;
+use crate::kernel::singles::{F32x32, SINGLES};
 
 /// Integer that sums are kept in; arithmetic wraps, and the caller proves that final values fit.
 pub trait Acc: RowSums + Copy + Default + PartialOrd + std::fmt::Debug + 'static {
@@ -37,6 +38,8 @@ pub trait RowSum: Acc {
     fn times(n: u32, code: u32) -> Self;
     /// Rounded once.
     fn f32(self) -> f32;
+    /// `self - n * code` of any sign, rounded once.
+    fn behind(self, n: u32, code: u32) -> f32;
 }
 impl RowSum for u32 {
     #[inline(always)]
@@ -47,6 +50,10 @@ impl RowSum for u32 {
     fn f32(self) -> f32 {
         self as f32
     }
+    #[inline(always)]
+    fn behind(self, n: u32, code: u32) -> f32 {
+        (-(n as f64)).mul_add(code as f64, self as f64) as f32 // below 2^33: exact before the cast
+    }
 }
 impl RowSum for u64 {
     #[inline(always)]
@@ -56,6 +63,10 @@ impl RowSum for u64 {
     #[inline(always)]
     fn f32(self) -> f32 {
         self as f32
+    }
+    #[inline(always)]
+    fn behind(self, n: u32, code: u32) -> f32 {
+        self.wrapping_sub(n as u64 * code as u64) as i64 as f32
     }
 }
 
@@ -69,6 +80,11 @@ pub trait Code: Elem {
     fn square(self) -> Self::Square;
     /// `self - other >= 0`, rounded once.
     fn above(self, other: Self) -> f32;
+    /// The codes of 32 stored values.
+    ///
+    /// # Safety
+    /// 32 values can be read from `from` on.
+    unsafe fn codes<L: F32x32>(from: *const Self, flip: Self) -> L::Int;
 }
 impl Code for u8 {
     type Square = u16;
@@ -84,6 +100,11 @@ impl Code for u8 {
     #[inline(always)]
     fn above(self, other: u8) -> f32 {
         (self as i32 - other as i32) as f32
+    }
+    #[inline(always)]
+    unsafe fn codes<L: F32x32>(from: *const u8, flip: u8) -> L::Int {
+        // SAFETY: the caller's promise.
+        unsafe { L::load_u8(from, flip) }
     }
 }
 impl Code for u16 {
@@ -101,6 +122,11 @@ impl Code for u16 {
     fn above(self, other: u16) -> f32 {
         (self as i32 - other as i32) as f32
     }
+    #[inline(always)]
+    unsafe fn codes<L: F32x32>(from: *const u16, flip: u16) -> L::Int {
+        // SAFETY: the caller's promise.
+        unsafe { L::load_u16(from, flip) }
+    }
 }
 impl Code for u32 {
     type Square = u64;
@@ -117,6 +143,13 @@ impl Code for u32 {
     fn above(self, other: u32) -> f32 {
         self.wrapping_sub(other) as f32
     }
+    #[inline(always)]
+    unsafe fn codes<L: F32x32>(from: *const u32, flip: u32) -> L::Int {
+        // SAFETY: the caller's promise.
+        let codes = unsafe { from.cast::<[u32; SINGLES]>().read_unaligned() }.map(|v| v ^ flip);
+        // SAFETY: 32 values.
+        unsafe { L::load_u32(codes.as_ptr()) }
+    }
 }
 
 /// Exact for values below 2^52, in two operations on any vector unit.
@@ -128,6 +161,8 @@ fn small(v: u64) -> f64 {
 /// How the numerator n S2 - S1^2 = n^2 variance is made exact.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Width {
+    /// Everything is below 2^53: no product rounds.
+    Small,
     /// S1, S2 < 2^52: `S1^2 = p + e` by a fused product, `(n S2 - p) - e`. Below 2^53 every step is exact (all are
     /// integers); above, e is 2^-53 of p at most and the result is off by 1.5 * 2^-53 of itself at most.
     Direct,
@@ -141,7 +176,9 @@ impl Width {
     /// For windows of at most `n` voxels of codes up to `top`.
     pub fn of(n: u64, top: u32) -> Width {
         let limit = 1u128 << 52;
-        if n as u128 * (top as u128).pow(2) < limit {
+        if (n as u128 * top as u128).pow(2) < 1 << 53 {
+            Width::Small
+        } else if n as u128 * (top as u128).pow(2) < limit {
             Width::Direct
         } else if top == u16::MAX as u32 && (n as u128) << 30 < limit {
             Width::Centred
@@ -166,6 +203,12 @@ fn numerator_inner<X1: RowSum, X2: Acc>(s1: &[X1], s2: &[X2], n: &[u32], width: 
         n.mul_add(s2, -p) - e
     };
     match width {
+        Width::Small => {
+            for i in 0..len {
+                let a = small(s1[i].low());
+                out[i] = (n[i] as f64).mul_add(small(s2[i].low()), -(a * a));
+            }
+        }
         Width::Direct => {
             for i in 0..len {
                 out[i] = fused(n[i] as f64, small(s1[i].low()), small(s2[i].low()));
@@ -190,17 +233,22 @@ fn numerator_inner<X1: RowSum, X2: Acc>(s1: &[X1], s2: &[X2], n: &[u32], width: 
 
 crate::multiversion! {
     /// Mean of the stored values (`code - offset`), f64; `exact` says that S1 < 2^52.
-    pub fn mean_row[X1: RowSum](s1: &[X1], n: &[u32], offset: f64, exact: bool, out: &mut [f64]) -> () = mean_inner;
+    /// `inverse` holds the reciprocals of `n`.
+    pub fn mean_row[X1: RowSum](s1: &[X1], n: &[u32], inverse: &[f64], offset: f64, exact: bool, out: &mut [f64]) -> () = mean_inner;
 }
 
 #[inline(always)]
-fn mean_inner<X1: RowSum>(s1: &[X1], n: &[u32], offset: f64, exact: bool, out: &mut [f64]) {
+fn mean_inner<X1: RowSum>(s1: &[X1], n: &[u32], inverse: &[f64], offset: f64, exact: bool, out: &mut [f64]) {
     let len = out.len();
-    let (s1, n) = (&s1[..len], &n[..len]);
+    let (s1, n, inverse) = (&s1[..len], &n[..len], &inverse[..len]);
     if exact {
         for i in 0..len {
             let m = n[i] as f64;
-            out[i] = (-offset).mul_add(m, small(s1[i].low())) / m; // the numerator is an integer below 2^53: exact
+            let s = (-offset).mul_add(m, small(s1[i].low())); // an integer below 2^53: exact
+            // A quotient without a division: q is off by less than two units in the last place, and one step with the
+            // exact remainder rounds as the division does, since s / n lies at least 2^-32 units from any midpoint.
+            let q = s * inverse[i];
+            out[i] = (-q).mul_add(m, s).mul_add(inverse[i], q);
         }
     } else {
         for i in 0..len {
@@ -220,159 +268,12 @@ pub struct Polarity {
     pub constant: f32,
 }
 
-crate::multiversion! {
-    /// A 3.2: `t^beta`, from codes of the centre `v` (before `flip`), extremes and sums.
-    pub fn cdf_power_row[T: Code, X1: RowSum](
-        v: &[T], flip: T, lo: &[T], hi: &[T], s1: &[X1], n: &[u32], polarity: Polarity, out: &mut [f32]
-    ) -> () = cdf_power_inner;
-}
-
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn cdf_power_inner<T: Code, X1: RowSum>(
-    v: &[T],
-    flip: T,
-    lo: &[T],
-    hi: &[T],
-    s1: &[X1],
-    n: &[u32],
-    polarity: Polarity,
-    out: &mut [f32],
-) {
-    if polarity.flipped {
-        cdf_power_as::<T, X1, true>(v, flip, lo, hi, s1, n, polarity.constant, out);
-    } else {
-        cdf_power_as::<T, X1, false>(v, flip, lo, hi, s1, n, polarity.constant, out);
-    }
-}
-
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn cdf_power_as<T: Code, X1: RowSum, const FLIPPED: bool>(
-    v: &[T],
-    flip: T,
-    lo: &[T],
-    hi: &[T],
-    s1: &[X1],
-    n: &[u32],
-    constant: f32,
-    out: &mut [f32],
-) {
-    let len = out.len();
-    let (v, lo, hi, s1, n) = (&v[..len], &lo[..len], &hi[..len], &s1[..len], &n[..len]);
-    for at in (0..len).step_by(CHUNK) {
-        let end = len.min(at + CHUNK);
-        if lo[at..end].iter().zip(&hi[at..end]).fold(true, |flat, (a, b)| flat & (a == b)) {
-            out[at..end].fill(constant);
-            continue;
-        }
-        for i in at..end {
-            let c = v[i].code(flip);
-            let below = c.above(lo[i]);
-            let above = hi[i].above(c);
-            let small = T::TOP <= u16::MAX as u32; // differences below 2^24: exact
-            let range = if small { below + above } else { hi[i].above(lo[i]) };
-            // Sums of (v_i - min) and (max - v_i): exact, so beta keeps its relative accuracy whatever its size.
-            let over = s1[i].minus(X1::times(n[i], lo[i].u32())).f32();
-            let under = X1::times(n[i], hi[i].u32()).minus(s1[i]).f32();
-            let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
-            // One division for both quotients; range and q are at least 1 unless all is constant, their product below 2^96.
-            let inverse = 1.0 / (range * q);
-            let beta = p * range * inverse;
-            let beta = if beta > 1e-6 { beta } else { 1e-6 };
-            let beta = if beta < 1e6 { beta } else { 1e6 };
-            let near = 3.0 * b < range;
-            let y = math::power_of(if near { -b } else { a } * (q * inverse), near, beta);
-            let y = if a == 0.0 { 0.0 } else { y };
-            let y = if b == 0.0 { 1.0 } else { y };
-            out[i] = if range == 0.0 { constant } else { y };
-        }
-    }
-}
-
-/// Voxels whose windows are asked together whether they are all constant, as in air that a detector or a mask has set to
-/// one value.
-const CHUNK: usize = 64;
-
 /// Estimators that use the mean and the variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Spread {
     Gaussian,
     Chebyshev,
     Literal,
-}
-
-/// Openness from `d = n (v - mean)` and `m = n^2 variance > 0`, both rounded to f32 from exact values.
-#[inline(always)]
-pub fn spread(kind: Spread, d: f32, m: f32) -> f32 {
-    match kind {
-        Spread::Gaussian => math::phi(d / m.sqrt()),
-        // 1 - m / (m + d^2) without the cancellation
-        Spread::Chebyshev => {
-            if d <= 0.0 {
-                0.0
-            } else {
-                d * d / d.mul_add(d, m)
-            }
-        }
-        Spread::Literal => {
-            if d <= 0.0 {
-                1.0
-            } else {
-                m / d.mul_add(d, m)
-            }
-        }
-    }
-}
-
-crate::multiversion! {
-    /// A 3.3 and E 3.4 from codes of the centre, S1 and the numerator row.
-    pub fn spread_row[T: Code, X1: RowSum](
-        kind: Spread, v: &[T], flip: T, s1: &[X1], n: &[u32], numerator: &[f64], polarity: Polarity, out: &mut [f32]
-    ) -> () = spread_inner;
-}
-
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn spread_inner<T: Code, X1: RowSum>(
-    kind: Spread,
-    v: &[T],
-    flip: T,
-    s1: &[X1],
-    n: &[u32],
-    numerator: &[f64],
-    polarity: Polarity,
-    out: &mut [f32],
-) {
-    let len = out.len();
-    let (v, s1, n, numerator) = (&v[..len], &s1[..len], &n[..len], &numerator[..len]);
-    let sign = if polarity.flipped { -1.0 } else { 1.0 };
-    macro_rules! row {
-        ($kind:expr) => {
-            for at in (0..len).step_by(CHUNK) {
-                let end = len.min(at + CHUNK);
-                if numerator[at..end].iter().fold(true, |flat, m| flat & (*m == 0.0)) {
-                    out[at..end].fill(polarity.constant);
-                    continue;
-                }
-                for i in at..end {
-                    let c = v[i].code(flip).u32();
-                    let d = if T::TOP <= u16::MAX as u32 {
-                        (n[i] as f64).mul_add(c as f64, -small(s1[i].low())) as f32 // n < 2^31: exact before the cast
-                    } else {
-                        (n[i] as u64 * c as u64).wrapping_sub(s1[i].low()) as i64 as f32
-                    };
-                    let y = spread($kind, sign * d, numerator[i] as f32);
-                    out[i] = if numerator[i] == 0.0 { polarity.constant } else { y };
-                }
-            }
-        };
-    }
-    match kind {
-        Spread::Gaussian => row!(Spread::Gaussian),
-        Spread::Chebyshev => row!(Spread::Chebyshev),
-        Spread::Literal => row!(Spread::Literal),
-    }
 }
 
 /// [`super::beta`] from codes of the centre, extremes, S1 and the numerator row.
@@ -417,14 +318,25 @@ fn quantise_inner(openness: &[f32], out: &mut [u8]) {
 }
 
 crate::multiversion! {
-    /// Variance from its numerator.
-    pub fn variance_row[](numerator: &[f64], n: &[u32], out: &mut [f64]) -> () = variance_inner;
+    /// Variance from its numerator, within 2^-51 of itself; `inverse` holds the reciprocals of the counts.
+    pub fn variance_row[](numerator: &[f64], inverse: &[f64], out: &mut [f64]) -> () = variance_inner;
 }
 
 #[inline(always)]
-fn variance_inner(numerator: &[f64], n: &[u32], out: &mut [f64]) {
-    for ((o, m), n) in out.iter_mut().zip(numerator).zip(n) {
-        let n = *n as f64;
-        *o = m / (n * n);
+fn variance_inner(numerator: &[f64], inverse: &[f64], out: &mut [f64]) {
+    for ((o, m), n) in out.iter_mut().zip(numerator).zip(inverse) {
+        *o = m * n * n;
+    }
+}
+
+crate::multiversion! {
+    /// Reciprocals of counts.
+    pub fn inverse_row[](n: &[u32], out: &mut [f64]) -> () = inverse_inner;
+}
+
+#[inline(always)]
+fn inverse_inner(n: &[u32], out: &mut [f64]) {
+    for (o, n) in out.iter_mut().zip(n) {
+        *o = 1.0 / *n as f64;
     }
 }

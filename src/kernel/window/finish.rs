@@ -2,7 +2,7 @@
 //! functions, so that the bits are the same.
 
 use super::emit::{Emit, IntRow};
-use super::estimate::{Acc, Code, RowSum, Width};
+use super::estimate::{self, Acc, Code, RowSum, Width};
 use super::int::{Dispatch, Setup};
 use super::plan::{self, Job, Needs, Plain, cut, padded};
 use super::{Place, WindowOut, check};
@@ -75,7 +75,8 @@ fn typed<S: Voxel + Plain, C: Dispatch>(
     // The whole call's job, not the part's: widths must not depend on how a call was cut.
     let job = Job::new(src.shape, dst, Place::whole(at), params, needs, plan::batch_bytes(S::DTYPE, needs));
     let width = job.tile[1];
-    let mut bytes = cx.scratch.take(Emit::bytes(width) + 2 * padded::<C>(width) + 2 * padded::<u32>(width));
+    let mut bytes =
+        cx.scratch.take(Emit::bytes(width) + 2 * padded::<C>(width) + 2 * padded::<u32>(width) + padded::<f64>(width));
     let mut emit = Emit::new(outs, params, cx.level, width, &mut bytes);
     let setup = Setup { job: &job, level: cx.level, flip, missing: None };
     let view = View { data: plan::bits::<C, S>(src.data), shape: src.shape, plane: src.plane, row: src.row };
@@ -106,6 +107,7 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
     let bytes = &mut bytes;
     let (lo, hi) = (cut::<T>(bytes, most), cut::<T>(bytes, most));
     let (n, columns) = (cut::<u32>(bytes, most), cut::<u32>(bytes, most));
+    let inverse = cut::<f64>(bytes, most);
     let width = Width::of(job.counts().0, T::TOP);
     let [nz, ny, nx] = part.shape;
     for x in (0..nx).step_by(most) {
@@ -117,6 +119,7 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
             let from = (z * ny + y) * nx + x;
             let section = (job.count(0, oz) * job.count(1, oy)) as u32;
             n[..len].iter_mut().zip(&*columns).for_each(|(n, c)| *n = section * c);
+            estimate::inverse_row(setup.level, &n[..len], inverse);
             if job.needs.extremes {
                 for (i, e) in part.extremes[from..from + len].iter().enumerate() {
                     (lo[i], hi[i]) = (T::from_f64((e & 0xffff) as f64), T::from_f64((e >> 16) as f64));
@@ -131,6 +134,8 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
                 s1: if job.needs.mean { &s1[from..from + len] } else { &[] },
                 s2: if job.needs.variance { &s2[from..from + len] } else { &[] },
                 n: &n[..len],
+                inverse: &inverse[..len],
+                most: job.counts().0,
                 width,
             };
             emit.int_row(setup, row, [oz, oy, first]);

@@ -83,6 +83,7 @@ impl<'a, T: Float> Lines<'a, T> {
             let z = (self.first + i as isize) as usize;
             let from = &src.row_at(z, y)[tile.cols.2..tile.cols.2 + cols];
             self.buffer[i * self.pitch + tile.cols.0..][..cols].copy_from_slice(from);
+            plan::fetch_below(src, [z, y, tile.cols.2], cols);
         }
     }
 }

@@ -6,7 +6,7 @@
 
 use super::along::SLACK;
 use super::emit::{Emit, IntRow};
-use super::estimate::{Acc, Code, RowSum, Width};
+use super::estimate::{self, Acc, Code, RowSum, Width};
 use super::extremes::{blocked, deep_len, rows_extremes};
 use super::lines::{self, Add, Coding, Masked, Op, Sources};
 use super::plan::{Job, Plain, Stage, Tile, bits, cut, padded};
@@ -158,6 +158,7 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
         + Moment::<u32, u32, u32>::bytes(job, masked)
         + 2 * padded::<u32>(job.tile[1])
+        + padded::<f64>(job.tile[1])
 }
 
 /// What becomes of a code in a running sum.
@@ -326,6 +327,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let mut count = Moment::<u32, u32, u32>::cut(job, M, bytes);
     let n = cut::<u32>(bytes, job.tile[1]);
     let columns = cut::<u32>(bytes, job.tile[1]);
+    let inverse = cut::<f64>(bytes, job.tile[1]);
     let coding = Coding { flip, missing: missing.unwrap_or_default() };
     let plain = Coding { flip: T::default(), missing: T::default() };
     let width = Width::of(job.counts().0, T::TOP);
@@ -407,11 +409,13 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                     }
                     if M {
                         count.finish_row(level, job, j);
+                        estimate::inverse_row(level, &count.out[..tile.size[1]], inverse);
                     } else {
                         let rows = job.count(1, y + j);
                         if rows != rows_counted {
                             let section = (section * rows) as u32;
                             n[..tile.size[1]].iter_mut().zip(&*columns).for_each(|(n, c)| *n = section * c);
+                            estimate::inverse_row(level, &n[..tile.size[1]], inverse);
                             rows_counted = rows;
                         }
                     }
@@ -423,6 +427,8 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                         s1: s1.out,
                         s2: s2.out,
                         n: if M { count.out } else { n },
+                        inverse,
+                        most: job.counts().0,
                         width,
                     };
                     emit.int_row(setup, row, [z, y + j, x]);

@@ -24,6 +24,7 @@ mod lines;
 pub mod math;
 mod merge;
 mod moments;
+mod openness;
 mod parts;
 mod plan;
 #[doc(hidden)]
