@@ -1,6 +1,8 @@
-//! Decoded chunks of all inputs under one byte limit. Every chunk knows how many bricks will still read it, so it leaves
-//! when the last one has; under pressure the least recently used goes first.
+//! Decoded chunks of all inputs under one byte limit. The order of bricks is known, so every chunk knows how many bricks
+//! will still read it, and which next: it leaves when the last one has, and under pressure the one that is needed last goes
+//! first (Belady, IBM Systems Journal 5, 1966).
 
+use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::sync::{Arc, Condvar, Mutex};
 
@@ -14,8 +16,20 @@ use crate::store::source::ChunkRead;
 /// Which chunk: input, component, index.
 type Key = (usize, usize, [i64; 3]);
 
-/// In place of a number of uses: a mask looks at the chunk, and the brick itself may still read it.
-pub const UNCOUNTED: u32 = u32::MAX;
+/// What is known of a chunk's future when a brick reads it.
+#[derive(Debug, Clone, Copy)]
+pub struct Future {
+    /// Bricks of the stream that read it, or `None` if this is no brick's read: a mask looks at it, and the brick itself may
+    /// still read it.
+    pub uses: Option<u32>,
+    /// Place in the order of bricks of the next that reads it, after this one.
+    pub next: u32,
+}
+
+impl Future {
+    /// Nobody knows: kept before all else, and of these the least recently used goes first.
+    pub const UNKNOWN: Future = Future { uses: None, next: 0 };
+}
 
 /// A decoded chunk.
 #[derive(Debug, Clone)]
@@ -28,7 +42,7 @@ pub enum Chunk {
 #[derive(Debug)]
 enum Slot {
     Loading,
-    Ready { chunk: Chunk, bytes: u64, last: u64 },
+    Ready { chunk: Chunk, bytes: u64, next: u32, last: u64 },
 }
 
 #[derive(Debug, Default)]
@@ -53,18 +67,17 @@ impl ChunkCache {
         ChunkCache { limit, state: Mutex::default(), loaded: Condvar::new() }
     }
 
-    /// One chunk for one brick: from the cache, or decoded once even if several ask. `uses` is how many bricks of the
-    /// stream read this chunk.
-    pub fn get(&self, source: &Source, key: Key, uses: u32, pool: &Pool, metrics: &Metrics) -> Result<Chunk> {
+    /// One chunk for one brick: from the cache, or decoded once even if several ask.
+    pub fn get(&self, source: &Source, key: Key, future: Future, pool: &Pool, metrics: &Metrics) -> Result<Chunk> {
         let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
         loop {
             state.clock += 1;
             let now = state.clock;
             match state.slots.get_mut(&key) {
-                Some(Slot::Ready { chunk, last, .. }) => {
-                    *last = now;
+                Some(Slot::Ready { chunk, last, next, .. }) => {
+                    (*last, *next) = (now, future.next);
                     let chunk = chunk.clone();
-                    self.used(&mut state, key, uses);
+                    used(&mut state, key, future);
                     return Ok(chunk);
                 }
                 Some(Slot::Loading) => state = self.loaded.wait(state).unwrap_or_else(|e| e.into_inner()),
@@ -79,8 +92,8 @@ impl ChunkCache {
             Ok((chunk, bytes)) => {
                 let last = state.clock;
                 state.bytes += bytes;
-                state.slots.insert(key, Slot::Ready { chunk: chunk.clone(), bytes, last });
-                self.used(&mut state, key, uses);
+                state.slots.insert(key, Slot::Ready { chunk: chunk.clone(), bytes, next: future.next, last });
+                used(&mut state, key, future);
                 self.evict(&mut state);
                 Ok(chunk)
             }
@@ -93,33 +106,31 @@ impl ChunkCache {
         result
     }
 
-    /// Counts one use; after the last the chunk leaves. A look that is no brick's read ([`UNCOUNTED`]) leaves the count alone.
-    fn used(&self, state: &mut State, key: Key, uses: u32) {
-        if uses == UNCOUNTED {
-            return;
-        }
-        let left = state.left.entry(key).or_insert(uses);
-        *left = left.saturating_sub(1);
-        if *left == 0 {
-            remove(state, key);
-        }
-    }
-
     fn evict(&self, state: &mut State) {
         while state.bytes > self.limit {
-            let oldest = state
+            let latest = state
                 .slots
                 .iter()
                 .filter_map(|(k, s)| match s {
-                    Slot::Ready { last, bytes, .. } if *bytes > 0 => Some((*last, *k)),
+                    Slot::Ready { next, last, bytes, .. } if *bytes > 0 => Some((*next, Reverse(*last), *k)),
                     _ => None,
                 })
-                .min();
-            match oldest {
-                Some((_, key)) => remove(state, key),
+                .max();
+            match latest {
+                Some((_, _, key)) => remove(state, key),
                 None => break,
             }
         }
+    }
+}
+
+/// Counts one use; after the last the chunk leaves.
+fn used(state: &mut State, key: Key, future: Future) {
+    let Some(uses) = future.uses else { return };
+    let left = state.left.entry(key).or_insert(uses);
+    *left = left.saturating_sub(1);
+    if *left == 0 {
+        remove(state, key);
     }
 }
 
@@ -147,36 +158,95 @@ fn load(source: &Source, key: Key, pool: &Pool, metrics: &Metrics) -> Result<(Ch
     }
 }
 
-/// How many of the stream's bricks read a chunk: bricks are boxes of intervals per axis, so the counts multiply.
+/// Which of the stream's bricks read a chunk. Bricks are boxes of intervals per axis.
 #[derive(Debug, Clone)]
 pub struct Uses {
     chunk: Shape,
-    /// Per axis and chunk index along it: the intervals that touch it.
-    per_axis: [Vec<u32>; 3],
+    /// Per axis and chunk index along it: the intervals that touch it, half-open.
+    touching: [Vec<(u32, u32)>; 3],
+    /// Intervals per axis.
+    counts: Shape,
+    /// Place in the order by the brick's intervals; `ABSENT` where there is none.
+    order: Vec<u32>,
 }
 
+const ABSENT: u32 = u32::MAX;
+
 impl Uses {
-    /// `intervals[a]` are the bricks' extents along axis `a`, already grown and clipped.
-    pub fn new(intervals: &[Vec<(i64, i64)>; 3], chunk: Shape, volume: Shape) -> Uses {
-        let per_axis = std::array::from_fn(|a| {
-            let mut counts = vec![0u32; volume[a].div_ceil(chunk[a])];
-            for &(lo, hi) in &intervals[a] {
-                let (first, last) = (lo as usize / chunk[a], (hi as usize - 1) / chunk[a]);
-                counts[first..=last].iter_mut().for_each(|c| *c += 1);
-            }
-            counts
+    /// `bricks` are the stream's bricks in order, grown by their halo and clipped.
+    pub fn new(bricks: &[Region], chunk: Shape, volume: Shape) -> Uses {
+        let intervals: [Vec<(i64, i64)>; 3] = std::array::from_fn(|a| {
+            let mut list: Vec<(i64, i64)> = bricks.iter().map(|b| (b.lo[a], b.hi[a])).collect();
+            list.sort_unstable();
+            list.dedup();
+            list
         });
-        Uses { chunk, per_axis }
+        let touching = std::array::from_fn(|a| {
+            let cells = 0..volume[a].div_ceil(chunk[a]) as i64;
+            let (edge, list) = (chunk[a] as i64, &intervals[a]);
+            let of = |c: i64| {
+                let first = list.partition_point(|i| i.1 <= c * edge);
+                (first as u32, (first + list[first..].partition_point(|i| i.0 < (c + 1) * edge)) as u32)
+            };
+            cells.map(of).collect()
+        });
+        let counts = intervals.each_ref().map(Vec::len);
+        let mut order = vec![ABSENT; counts.iter().product()];
+        for (place, b) in bricks.iter().enumerate() {
+            let at: [usize; 3] = std::array::from_fn(|a| intervals[a].partition_point(|i| *i < (b.lo[a], b.hi[a])));
+            order[(at[0] * counts[1] + at[1]) * counts[2] + at[2]] = place as u32;
+        }
+        Uses { chunk, touching, counts, order }
     }
 
-    pub fn of(&self, chunk: [i64; 3]) -> u32 {
-        (0..3)
-            .map(|a| self.per_axis[a].get(chunk[a] as usize).copied().unwrap_or(1))
-            .fold(1u32, |p, n| p.saturating_mul(n))
+    /// The future of a chunk that the brick at place `now` reads.
+    pub fn of(&self, chunk: [i64; 3], now: u32) -> Future {
+        let (mut uses, mut next) = (0u32, ABSENT);
+        let [z, y, x] = std::array::from_fn(|a| self.touching[a].get(chunk[a] as usize).copied().unwrap_or((0, 0)));
+        for z in z.0..z.1 {
+            for y in y.0..y.1 {
+                let row = (z as usize * self.counts[1] + y as usize) * self.counts[2];
+                for &place in &self.order[row + x.0 as usize..row + x.1 as usize] {
+                    uses += (place != ABSENT) as u32;
+                    if place > now {
+                        next = next.min(place);
+                    }
+                }
+            }
+        }
+        Future { uses: Some(uses.max(1)), next }
     }
 
     /// Chunks that a box touches.
     pub fn chunks(&self, region: Region) -> Region {
         region.cells([0; 3], self.chunk)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn futures_are_those_of_the_order() {
+        let (volume, chunk) = (Region::whole([90, 50, 70]), [16, 32, 10]);
+        let mut bricks: Vec<Region> = volume
+            .cells([0; 3], [32, 16, 40])
+            .iter()
+            .map(|c| Region::of_cell(c, [0; 3], [32, 16, 40]).grow([5, 7, 3]).clip(&volume))
+            .collect();
+        bricks.reverse();
+        bricks.remove(4); // not every product of intervals is a brick
+        let uses = Uses::new(&bricks, chunk, volume.shape());
+        for c in volume.cells([0; 3], chunk).iter() {
+            let cell = Region::of_cell(c, [0; 3], chunk).clip(&volume);
+            let readers: Vec<u32> =
+                (0..bricks.len()).filter(|&b| !bricks[b].clip(&cell).is_empty()).map(|b| b as u32).collect();
+            for now in 0..bricks.len() as u32 {
+                let next = readers.iter().copied().find(|&b| b > now).unwrap_or(ABSENT);
+                let future = uses.of(c, now);
+                assert_eq!((future.uses, future.next), (Some(readers.len().max(1) as u32), next), "{c:?} {now}");
+            }
+        }
     }
 }

@@ -4,7 +4,7 @@
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
-use super::cache::{Chunk, ChunkCache, UNCOUNTED, Uses};
+use super::cache::{Chunk, ChunkCache, Future, Uses};
 use super::metrics::Metrics;
 use super::program::Program;
 use super::steps::{Engine, MaskValue};
@@ -40,7 +40,8 @@ pub struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    pub fn read(&self, brick: Region) -> Result<Loaded> {
+    /// Reads the brick at `place` in the stream's order.
+    pub fn read(&self, brick: Region, place: u32) -> Result<Loaded> {
         let start = Instant::now();
         let plan = self.engine.plan;
         let volume = Region::whole(self.program.volume);
@@ -56,7 +57,7 @@ impl Reader<'_> {
             let Producer::Input(input) = plan.graph.wires[mask.wire].producer else { continue };
             let region = self.program.step_box(plan, s, brick);
             let wanted = region.grow(mask.reach).clip(&volume);
-            let (mut value, _) = self.input(input, mask.wire, wanted, false)?;
+            let (mut value, _) = self.input(input, mask.wire, wanted, place, false)?;
             let known = self.engine.mask(mask, &mut value, region, volume);
             value.recycle(self.engine.pool);
             if matches!(known, MaskValue::None) && self.engine.skip {
@@ -71,7 +72,7 @@ impl Reader<'_> {
             }
             let Producer::Input(input) = plan.graph.wires[wire].producer else { continue };
             let region = wire_box(brick, halo, self.program.volume);
-            let (value, missing) = self.input(input, wire, region, true)?;
+            let (value, missing) = self.input(input, wire, region, place, true)?;
             self.metrics.gathered(region.voxels() as u64);
             loaded.all_missing &= missing;
             loaded.values[wire] = Some(value);
@@ -81,13 +82,13 @@ impl Reader<'_> {
     }
 
     /// All components of an input over a box, and whether nothing of it is stored.
-    fn input(&self, input: usize, wire: WireId, region: Region, counts: bool) -> Result<(Value, bool)> {
+    fn input(&self, input: usize, wire: WireId, region: Region, place: u32, counts: bool) -> Result<(Value, bool)> {
         let wire = &self.engine.plan.graph.wires[wire];
         let mut all_missing = true;
         let comps = (0..wire.components)
             .map(|c| {
                 let (comp, missing) = match &self.uses[input] {
-                    Some(uses) => self.chunked(input, c, region, uses, counts)?,
+                    Some(uses) => self.chunked(input, c, region, uses, place, counts)?,
                     None => (self.plain(input, c, region)?, false),
                 };
                 all_missing &= missing;
@@ -114,7 +115,15 @@ impl Reader<'_> {
         Ok(Comp::Voxels(voxels))
     }
 
-    fn chunked(&self, input: usize, comp: usize, region: Region, uses: &Uses, counts: bool) -> Result<(Comp, bool)> {
+    fn chunked(
+        &self,
+        input: usize,
+        comp: usize,
+        region: Region,
+        uses: &Uses,
+        place: u32,
+        counts: bool,
+    ) -> Result<(Comp, bool)> {
         let source = &self.sources[input];
         let info = source.info();
         let shape = info.chunk.expect("a chunked source");
@@ -122,8 +131,11 @@ impl Reader<'_> {
         let mut target = None;
         let mut common: Option<f64> = None;
         for index in cells.iter() {
-            let uses = if counts { uses.of(index) } else { UNCOUNTED };
-            let chunk = self.cache.get(source, (input, comp, index), uses, self.engine.pool, self.metrics)?;
+            let mut future = uses.of(index, place);
+            if !counts {
+                future = Future { uses: None, next: place };
+            }
+            let chunk = self.cache.get(source, (input, comp, index), future, self.engine.pool, self.metrics)?;
             let chunk_box = Region::of_cell(index, [0; 3], shape);
             if let (Chunk::Missing(value), None) = (&chunk, &target)
                 && self.engine.skip

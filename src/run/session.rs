@@ -348,7 +348,7 @@ impl<'a> Session<'a> {
         stream.run()
     }
 
-    /// How often each chunk of each chunked input will be read by the work ahead.
+    /// By which of the work ahead each chunk of each chunked input will be read.
     fn uses(&self, program: &Program, work: &[Work]) -> Vec<Option<Uses>> {
         let by_input = |input: usize| {
             let chunk = self.infos[input].chunk?;
@@ -356,19 +356,9 @@ impl<'a> Session<'a> {
                 (self.plan.graph.wires[w].producer == crate::plan::graph::Producer::Input(input)).then_some(halo)
             })?;
             let volume = self.infos[input].shape;
-            let intervals = std::array::from_fn(|a| {
-                let mut list: Vec<(i64, i64)> = work
-                    .iter()
-                    .map(|w| {
-                        let grown = crate::plan::memory::wire_box(w.brick, halo, volume);
-                        (grown.lo[a], grown.hi[a])
-                    })
-                    .collect();
-                list.sort_unstable();
-                list.dedup();
-                list
-            });
-            Some(Uses::new(&intervals, chunk, volume))
+            let grown: Vec<Region> =
+                work.iter().map(|w| crate::plan::memory::wire_box(w.brick, halo, volume)).collect();
+            Some(Uses::new(&grown, chunk, volume))
         };
         (0..self.sources.len()).map(by_input).collect()
     }

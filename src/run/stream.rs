@@ -117,6 +117,7 @@ impl<W: Send> Stream<'_, W> {
             if first.stopped() || self.cancel.is_cancelled() {
                 return;
             }
+            let place = *next as u32;
             *next += 1;
             let bytes = self.brick_bytes * work.brick.voxels() as u64 / self.brick_voxels.max(1);
             // A brick cut by the volume's edge still has whole halos: count at least half.
@@ -124,7 +125,7 @@ impl<W: Send> Stream<'_, W> {
             drop(next);
             self.metrics.waited("budget", waited);
             let start = Instant::now();
-            let read = guarded(|| self.reader.read(work.brick));
+            let read = guarded(|| self.reader.read(work.brick, place));
             self.trace.span("read", start, &[("brick", format!("{:?}", work.brick))]);
             match read {
                 Ok(loaded) => {
