@@ -2,6 +2,7 @@
 //! asserts, and `benches/stress.rs`, which prints the table of worst cases.
 #![allow(dead_code)] // each of the two uses its own part
 
+pub mod counted;
 pub mod exact;
 pub mod fields;
 pub mod functions;
