@@ -132,7 +132,9 @@ fn channel_exists(config: &Config, reference: &Ref) -> Result<(), String> {
         (Some(Op::Obscurance(o)), Some("rgb")) if o.colour.is_none() => {
             Err(format!("stage {:?} has channel rgb only with its key `colour`", reference.name))
         }
-        (Some(Op::AmbientOcclusion { method, .. }), Some(bound @ ("lower" | "upper"))) if *method != Method::Moments4 => {
+        (Some(Op::AmbientOcclusion { method, .. }), Some(bound @ ("lower" | "upper")))
+            if *method != Method::Moments4 =>
+        {
             let word = super::stages::method_word(*method);
             let name = &reference.name;
             Err(format!("stage {name:?} has no channel {bound:?} with method {word:?}; method \"moments4\" has it"))

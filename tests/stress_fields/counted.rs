@@ -42,7 +42,15 @@ pub fn measure(field: &Field) -> Counted {
     let [lower, middle, upper] = [Bound::Lower, Bound::Openness, Bound::Upper].map(|channel| {
         run(&volume, |scratch, out| {
             let mut outs = [BoundOut { channel, dst: out.view_mut(shape) }];
-            moments4::moments4(volume.view(shape), Some(&codes), &params, Ties::Mid, [0; 3], &mut outs, &mut cx(scratch));
+            moments4::moments4(
+                volume.view(shape),
+                Some(&codes),
+                &params,
+                Ties::Mid,
+                [0; 3],
+                &mut outs,
+                &mut cx(scratch),
+            );
         })
     });
     let mut found = Counted::default();

@@ -53,8 +53,20 @@ pub fn bounds(n: f64, [t1, t2, t3, t4]: [f64; 4]) -> (f64, f64) {
 
     // Both nodes on one side: the square is at least 1 on the other.
     let one = sum + error;
-    let no_more = if between { mid_upper } else if beside && b <= 0.0 { one } else { n };
-    let no_less = if between { mid_lower } else if beside && b >= 0.0 { n - one } else { 0.0 };
+    let no_more = if between {
+        mid_upper
+    } else if beside && b <= 0.0 {
+        one
+    } else {
+        n
+    };
+    let no_less = if between {
+        mid_lower
+    } else if beside && b >= 0.0 {
+        n - one
+    } else {
+        0.0
+    };
     upper = least(no_more, upper);
     lower = greatest(no_less, lower);
     // Counts are whole.
@@ -103,7 +115,9 @@ mod tests {
     #[test]
     fn three_values_or_fewer_are_known_exactly() {
         // Distinct values, the centre's 0 among them, with any number of voxels each.
-        for (low, high) in [(-1.0, 2.0), (-65535.0, 1.0), (3.0, 900.0), (-7.0, -5.0), (-1.0, 65535.0), (-20000.0, 40000.0)] {
+        for (low, high) in
+            [(-1.0, 2.0), (-65535.0, 1.0), (3.0, 900.0), (-7.0, -5.0), (-1.0, 65535.0), (-20000.0, 40000.0)]
+        {
             for [a, b, c] in [[1, 1, 1], [5, 2, 20], [100, 1, 1], [1, 4000, 1], [300, 1, 900], [0, 7, 20], [7, 20, 0]] {
                 let mut x = vec![low; a];
                 x.extend(vec![0.0; b]);
@@ -142,7 +156,10 @@ mod tests {
             for centre in values.clone() {
                 let x: Vec<f64> = values.iter().map(|v| v - centre).collect();
                 let ((lower, upper), (below, at_most)) = (bounds(n as f64, sums(&x)), counts(&x));
-                assert!(0.0 <= lower && lower <= below && at_most <= upper && upper <= n as f64, "{case} {centre} {values:?}");
+                assert!(
+                    0.0 <= lower && lower <= below && at_most <= upper && upper <= n as f64,
+                    "{case} {centre} {values:?}"
+                );
                 assert!(lower.fract() == 0.0 && upper.fract() == 0.0);
                 width = [width[0] + (upper - lower) / n as f64, width[1] + 1.0];
             }

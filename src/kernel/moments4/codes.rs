@@ -159,7 +159,8 @@ mod tests {
 
     #[test]
     fn outliers_leave_the_others_their_resolution() {
-        let at: Vec<f64> = (0..64).map(|k| [-1e30, 100.0 + k as f64, 1e30][(k > 0) as usize + (k == 63) as usize]).collect();
+        let at: Vec<f64> =
+            (0..64).map(|k| [-1e30, 100.0 + k as f64, 1e30][(k > 0) as usize + (k == 63) as usize]).collect();
         let codes = Codes::new(&levels(&at, &[]));
         assert!(codes.of(150.0) - codes.of(149.0) > 200);
         assert_eq!((codes.of(-1e30), codes.of(1e30)), (0, GONE - 1));

@@ -199,7 +199,7 @@ impl Job<'_, '_> {
         let (lines, bytes) = cut::<f64>(bytes, lines);
         let (columns, _) = cut::<f64>(bytes, tile.dst[2]);
         columns.iter_mut().enumerate().for_each(|(x, c)| *c = tile.window(2, x).len() as f64);
-        let work = [plane, run, lines].map(|w| bytemuck::cast_slice_mut::<f64, i64>(w));
+        let work = [plane, run, lines].map(bytemuck::cast_slice_mut::<f64, i64>);
         let w = 2 * tile.radius[2] + 1;
         let mut group = Group::NONE;
         sweep::<T, C, M>(level, codes, missing, tile, work, |z, y, lines| {

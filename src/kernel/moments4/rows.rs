@@ -20,8 +20,7 @@ pub struct Group {
 }
 
 impl Group {
-    pub const NONE: Group =
-        Group { n: [1.0; GROUP], lower: [0.0; GROUP], upper: [0.0; GROUP], known: [0.0; GROUP] };
+    pub const NONE: Group = Group { n: [1.0; GROUP], lower: [0.0; GROUP], upper: [0.0; GROUP], known: [0.0; GROUP] };
 }
 
 /// Which count is asked for.
@@ -43,6 +42,7 @@ multiversion! {
 }
 
 #[inline(always)]
+#[allow(clippy::too_many_arguments)]
 fn bound_inner<T: Code, const C: usize, const M: bool>(
     _: Sums<C, M>,
     lines: &[i64],
@@ -183,9 +183,7 @@ mod tests {
                 total(&|q| q.pow(3) >> COARSE[1]) as i64,
             ];
             let expect: Vec<f64> = (1..5).map(|k| total(&|q| (q - z as i128).pow(k)) as f64).collect();
-            let close = |got: [f64; 4]| {
-                got.iter().zip(&expect).all(|(g, e)| (g - e).abs() <= e.abs() * 2f64.powi(-52))
-            };
+            let close = |got: [f64; 4]| got.iter().zip(&expect).all(|(g, e)| (g - e).abs() <= e.abs() * 2f64.powi(-52));
             let mut kinds = codes.clone();
             kinds.sort_unstable();
             kinds.dedup();

@@ -78,7 +78,13 @@ multiversion! {
 }
 
 #[inline(always)]
-fn slide_inner<T: Code, const C: usize, const M: bool>(_: Sums<C, M>, new: &[T], old: &[T], missing: T, sums: &mut [i64]) {
+fn slide_inner<T: Code, const C: usize, const M: bool>(
+    _: Sums<C, M>,
+    new: &[T],
+    old: &[T],
+    missing: T,
+    sums: &mut [i64],
+) {
     let blocks = new.len().max(old.len()).div_ceil(LANES);
     for (b, sums) in sums.chunks_exact_mut(LANES * C).take(blocks).enumerate() {
         let part = |row: &[T]| eight::<T, C, M>(&row[(b * LANES).min(row.len())..], missing);
@@ -117,7 +123,14 @@ multiversion! {
 }
 
 #[inline(always)]
-fn along_inner<const C: usize, const M: bool>(_: Sums<C, M>, row: &[i64], columns: usize, front: usize, pitch: usize, out: &mut [i64]) {
+fn along_inner<const C: usize, const M: bool>(
+    _: Sums<C, M>,
+    row: &[i64],
+    columns: usize,
+    front: usize,
+    pitch: usize,
+    out: &mut [i64],
+) {
     let mut lines = out.chunks_exact_mut(pitch);
     let mut lines: [&mut [i64]; C] = std::array::from_fn(|_| lines.next().expect("a line for every sum"));
     let mut total = [0i64; C];

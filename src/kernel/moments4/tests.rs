@@ -77,7 +77,10 @@ fn check(v: &Voxels, shape: Shape, p: &WindowParams, ties: Ties, what: &str) -> 
     let count = exact(v, shape, p, ties);
     let got = bricks(v, shape, p, ties, 1000, Level::detect());
     for level in Level::available() {
-        assert!(same(&got, &bricks(v, shape, p, ties, 1000, level)), "{what} {shape:?} {p:?} {ties:?}: {level:?} shows");
+        assert!(
+            same(&got, &bricks(v, shape, p, ties, 1000, level)),
+            "{what} {shape:?} {p:?} {ties:?}: {level:?} shows"
+        );
     }
     assert!(same(&got, &bricks(v, shape, p, ties, 7, Level::detect())), "{what} {shape:?} {p:?} {ties:?}: bricks show");
     let [open, lower, upper] = got;
@@ -147,9 +150,13 @@ fn hostile_fields() {
                 let width = check(&v, shape, &p, ties, name);
                 assert!(r != 3 || width <= widest, "{name} {dtype} {ties:?}: bounds of width {width}");
                 if name == "two values" || name == "extremes" || name == "outlier" {
-                    let (count, [open, ..]) = (exact(&v, shape, &p, ties), bricks(&v, shape, &p, ties, 50, Level::detect()));
+                    let (count, [open, ..]) =
+                        (exact(&v, shape, &p, ties), bricks(&v, shape, &p, ties, 50, Level::detect()));
                     let worst = (0..v.len()).map(|i| (open.at(i) - count.at(i)).abs()).fold(0.0, f64::max);
-                    assert!(worst <= 1e-7, "{name} {dtype} {ties:?} {r}: {worst} off although two values are known exactly");
+                    assert!(
+                        worst <= 1e-7,
+                        "{name} {dtype} {ties:?} {r}: {worst} off although two values are known exactly"
+                    );
                 }
             }
         }

@@ -58,8 +58,7 @@ pub fn bytes(src: Shape, dst: Shape, params: &WindowParams, channels: impl Itera
         return of(src, dst);
     }
     let small: Shape = std::array::from_fn(|a| BLOCK[a].min(dst[a]));
-    let seen: Shape =
-        std::array::from_fn(|a| small[a].saturating_add(params.radius[a].saturating_mul(2)).min(src[a]));
+    let seen: Shape = std::array::from_fn(|a| small[a].saturating_add(params.radius[a].saturating_mul(2)).min(src[a]));
     let own = padded::<f64>(seen.iter().product()) + 4 * padded::<f64>(small.iter().product());
     of(src, dst).max(own + of(seen, small))
 }
@@ -280,11 +279,16 @@ mod tests {
             let p = params(radius, affine, solid_low);
             let got = bricks(&v, &p, 100, Level::detect());
             for level in Level::available() {
-                assert!(got.iter().flatten().zip(bricks(&v, &p, 100, level).iter().flatten()).all(|(a, b)| same(*a, *b)));
+                assert!(
+                    got.iter().flatten().zip(bricks(&v, &p, 100, level).iter().flatten()).all(|(a, b)| same(*a, *b))
+                );
             }
             for edge in [5, 8, 33] {
                 let other = bricks(&v, &p, edge, Level::detect());
-                assert!(got.iter().flatten().zip(other.iter().flatten()).all(|(a, b)| same(*a, *b)), "bricks of {edge} show");
+                assert!(
+                    got.iter().flatten().zip(other.iter().flatten()).all(|(a, b)| same(*a, *b)),
+                    "bricks of {edge} show"
+                );
             }
             for (i, c) in Region::whole(SHAPE).iter().enumerate() {
                 let range = |a: usize| {
