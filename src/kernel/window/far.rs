@@ -5,7 +5,7 @@
 use super::float;
 use super::plan::{self, Job, Needs, cut, padded};
 use super::{Place, WindowOut};
-use crate::grid::{Affine, AnyViewMut, Region, Shape, View, ViewMut};
+use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::Context;
 use crate::kernel::simd::Level;
 use crate::stage::{WindowChannel, WindowParams};
@@ -43,25 +43,31 @@ pub fn run(src: View<f64>, params: &WindowParams, place: Place, dst: Shape, outs
 }
 
 /// Bytes of scratch.
-pub fn bytes(src: Shape, dst: Shape, params: &WindowParams, channels: impl Iterator<Item = WindowChannel>) -> usize {
-    let channels: [bool; 3] = channels.fold([false; 3], |[any, mean, variance], c| {
-        let needs = Needs::of([c].into_iter(), true);
-        [any || !plain(c), mean || needs.mean, variance || needs.variance]
-    });
-    let [again, mean, variance] = channels;
-    let of = |src: Shape, dst: Shape| {
-        let needs = Needs { extremes: true, mean, variance, float: true };
-        let moments = plan::batch_bytes(crate::grid::DType::F64, needs);
+pub fn bytes(
+    src: Shape,
+    dst: Shape,
+    params: &WindowParams,
+    channels: impl Iterator<Item = WindowChannel> + Clone,
+) -> usize {
+    let of = |src: Shape, dst: Shape, needs: Needs| {
+        let moments = plan::batch_bytes(DType::F64, needs);
         float::bytes::<f64>(&Job::new(src, dst, Place::whole([0; 3]), params, needs, moments))
     };
-    if !again {
-        return of(src, dst);
+    let once = of(src, dst, Needs::of(channels.clone(), true));
+    if channels.clone().all(plain) {
+        return once;
     }
     let small: Shape = std::array::from_fn(|a| BLOCK[a].min(dst[a]));
     let seen: Shape = std::array::from_fn(|a| small[a].saturating_add(params.radius[a].saturating_mul(2)).min(src[a]));
+    let again = |channels: [WindowChannel; 2]| of(seen, small, Needs::of(channels.into_iter(), true));
+    let statistics = again(EXTREMES).max(again(MOMENTS));
+    let most = channels.map(|c| again([c; 2])).fold(statistics, usize::max);
     let own = padded::<f64>(seen.iter().product()) + 4 * padded::<f64>(small.iter().product());
-    of(src, dst).max(own + of(seen, small))
+    once.max(own + most)
 }
+
+const EXTREMES: [WindowChannel; 2] = [WindowChannel::Min, WindowChannel::Max];
+const MOMENTS: [WindowChannel; 2] = [WindowChannel::Mean, WindowChannel::Variance];
 
 /// Channels that no square enters and no sum.
 fn plain(channel: WindowChannel) -> bool {
@@ -120,7 +126,7 @@ fn block(
         let mut outs: [WindowOut; 2] = std::array::from_fn(|_| outs.next().expect("two channels"));
         float::run(src, &stored, place, dst, &mut outs, level, bytes);
     };
-    rerun(part, [WindowChannel::Min, WindowChannel::Max], [&mut *least, &mut *most]);
+    rerun(part, EXTREMES, [&mut *least, &mut *most]);
     // Halves, since a difference may overflow.
     let span = |i: usize| (0.5 * most[i] - 0.5 * least[i]).abs() * 2.0;
     let size = |i: usize| most[i].abs().max(least[i].abs());
@@ -143,7 +149,7 @@ fn block(
         for out in outs.iter_mut().filter(|o| !plain(o.channel)) {
             let channel = out.channel;
             let openness = matches!(channel, WindowChannel::Openness(..));
-            let channels = if openness { [channel; 2] } else { [WindowChannel::Mean, WindowChannel::Variance] };
+            let channels = if openness { [channel; 2] } else { MOMENTS };
             rerun(scaled, channels, [&mut *one, &mut *two]);
             let AnyViewMut::F64(d) = &mut out.dst else { panic!("{channel:?} of f64 is written as f64") };
             for (i, c) in Region::whole(dst).iter().enumerate().filter(|(i, _)| asks(*i, channel)) {
@@ -176,7 +182,6 @@ fn back(channel: WindowChannel, mean: f64, variance: f64, exponent: i64, affine:
 mod tests {
     use super::*;
     use crate::brick::{Scratch, Voxels};
-    use crate::grid::DType;
     use crate::kernel::hostile::Noise;
     use crate::kernel::window::window;
     use crate::stage::{Method, Ties};
@@ -201,17 +206,21 @@ mod tests {
 
     /// All channels over bricks of one edge.
     fn bricks(v: &[f64], p: &WindowParams, edge: usize, level: Level) -> Vec<Vec<f64>> {
+        channels(v, p, edge, level, &CHANNELS)
+    }
+
+    fn channels(v: &[f64], p: &WindowParams, edge: usize, level: Level, channels: &[WindowChannel]) -> Vec<Vec<f64>> {
         let (whole, all) = (Region::whole(SHAPE), Voxels::F64(v.to_vec()));
-        let mut got = vec![Voxels::zeroed(DType::F64, v.len()); CHANNELS.len()];
+        let mut got = vec![Voxels::zeroed(DType::F64, v.len()); channels.len()];
         let mut scratch = Scratch::new();
         for cell in whole.cells([0; 3], [edge; 3]).iter() {
             let part = Region::of_cell(cell, [0; 3], [edge; 3]).clip(&whole);
             let grown = part.grow(p.radius).clip(&whole);
             let mut brick = Voxels::zeroed(DType::F64, grown.voxels());
             crate::brick::gather::copy_common(all.view(SHAPE), whole, brick.view_mut(grown.shape()), grown);
-            let mut made = vec![Voxels::zeroed(DType::F64, part.voxels()); CHANNELS.len()];
-            let mut outs: Vec<WindowOut> = (made.iter_mut().zip(CHANNELS))
-                .map(|(m, channel)| WindowOut { channel, dst: m.view_mut(part.shape()) })
+            let mut made = vec![Voxels::zeroed(DType::F64, part.voxels()); channels.len()];
+            let mut outs: Vec<WindowOut> = (made.iter_mut().zip(channels))
+                .map(|(m, &channel)| WindowOut { channel, dst: m.view_mut(part.shape()) })
                 .collect();
             let mut cx = Context { level, scratch: &mut scratch };
             let place = Place::new(grown.offset_of(&part), part.lo);
@@ -282,6 +291,10 @@ mod tests {
                 assert!(
                     got.iter().flatten().zip(bricks(&v, &p, 100, level).iter().flatten()).all(|(a, b)| same(*a, *b))
                 );
+            }
+            for (channel, joint) in CHANNELS.into_iter().zip(&got) {
+                let alone = channels(&v, &p, 20, Level::detect(), &[channel]);
+                assert!(alone[0].iter().zip(joint).all(|(a, b)| same(*a, *b)), "{channel:?} alone");
             }
             for edge in [5, 8, 33] {
                 let other = bricks(&v, &p, edge, Level::detect());
