@@ -1,4 +1,4 @@
-//! Times exact rank, quantile levels (beside `cdf_power`), Gaussian, the occlusion-map chain and gradient on one core: ns per output voxel, Mvoxel/s, and the
+//! Times exact rank, quantile levels, bounds by four moments (beside `cdf_power`), Gaussian, the occlusion-map chain and gradient on one core: ns per output voxel, Mvoxel/s, and the
 //! multiple of the time that memcpy takes for the same voxels of a 256^3 volume in this process. Each kernel's result on
 //! this CPU's level is compared with that of the portable code first.
 //!
@@ -13,11 +13,12 @@ use occlude::kernel::Context;
 use occlude::kernel::gaussian::{gaussian, reach};
 use occlude::kernel::gradient::{GradientOut, gradient};
 use occlude::kernel::levels::{Levels, levels};
+use occlude::kernel::moments4::{BoundOut, Codes, moments4};
 use occlude::kernel::occlusion_map::{Moments, base, coarsen};
 use occlude::kernel::rank::rank;
 use occlude::kernel::simd::Level;
 use occlude::kernel::window::{Place, WindowOut, window};
-use occlude::stage::{GradientWeight, Method, Ties, WindowChannel, WindowParams, WindowShape};
+use occlude::stage::{Bound, GradientWeight, Method, Ties, WindowChannel, WindowParams, WindowShape};
 
 /// Voxels of the output box: rows as a brick of the planner has them.
 const BOX: Shape = [64, 64, 256];
@@ -40,6 +41,9 @@ fn main() {
         }
         for (count, radius) in [(32, 5), (32, 10), (32, 64), (64, 10)] {
             row(format!("levels {count} radius {radius}"), levels_job(dtype, count, radius));
+        }
+        for radius in [5, 10, 64] {
+            row(format!("moments4 radius {radius}"), moments4_job(dtype, radius));
         }
         for radius in [10, 64] {
             row(format!("window cdf_power radius {radius}"), power_job(dtype, radius));
@@ -164,17 +168,29 @@ fn levels_job<'a>(dtype: DType, count: usize, radius: usize) -> Job<'a> {
     let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
     let mut chosen = None;
     Job::new(dtype, [radius; 3], move |src, at, out, cx| {
-        let chosen = chosen.get_or_insert_with(|| {
-            let n: usize = src.shape().iter().product();
-            let place = |i: usize| {
-                [i / src.shape()[2] / src.shape()[1], i / src.shape()[2] % src.shape()[1], i % src.shape()[2]]
-            };
-            let mut values: Vec<f64> = (0..n).step_by(97).map(|i| src.at_f64(place(i))).collect();
-            values.sort_by(f64::total_cmp);
-            let groups = values.chunk_by(|a, b| a == b).map(|g| (g[0], g.len() as u64));
-            Levels::choose(&groups.collect::<Vec<_>>(), count)
-        });
+        let chosen = chosen.get_or_insert_with(|| choose(&src, count));
         levels(src, chosen, &params, Ties::Le, at, out.view_mut(BOX), cx);
+    })
+}
+
+fn choose(src: &AnyView, count: usize) -> Levels {
+    let n: usize = src.shape().iter().product();
+    let place =
+        |i: usize| [i / src.shape()[2] / src.shape()[1], i / src.shape()[2] % src.shape()[1], i % src.shape()[2]];
+    let mut values: Vec<f64> = (0..n).step_by(97).map(|i| src.at_f64(place(i))).collect();
+    values.sort_by(f64::total_cmp);
+    let groups = values.chunk_by(|a, b| a == b).map(|g| (g[0], g.len() as u64));
+    Levels::choose(&groups.collect::<Vec<_>>(), count)
+}
+
+/// The middle of the bounds.
+fn moments4_job<'a>(dtype: DType, radius: usize) -> Job<'a> {
+    let params = WindowParams { radius: [radius; 3], affine: Affine::IDENTITY, missing: None, solid_low: false };
+    let mut codes = None;
+    Job::new(dtype, [radius; 3], move |src, at, out, cx| {
+        let codes = codes.get_or_insert_with(|| Codes::new(&choose(&src, 64)));
+        let mut outs = [BoundOut { channel: Bound::Openness, dst: out.view_mut(BOX) }];
+        moments4(src, Some(codes), &params, Ties::Le, at, &mut outs, cx);
     })
 }
 

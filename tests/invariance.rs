@@ -37,6 +37,19 @@ level_count = 16
 radius = [2, 3, 4]
 solid = "low"
 border = "nearest"
+[stage.between]
+op = "ambient_occlusion"
+input = "vol"
+method = "moments4"
+radius = [2, 3, 4]
+ties = "mid"
+[stage.wide]
+op = "ambient_occlusion"
+input = "bell.mean"
+method = "moments4"
+radius = 2
+solid = "low"
+border = { constant = 1000.5 }
 [stage.bell]
 op = "gaussian"
 input = "vol"
@@ -97,6 +110,14 @@ path = "out/shares.zarr"
 from = "shares"
 chunk = 16
 dtype = "native"
+[output.between]
+path = "out/between.zarr"
+from = ["between.lower", "between", "between.upper"]
+chunk = 16
+[output.wide]
+path = "out/wide.zarr"
+from = ["wide.lower", "wide.upper"]
+chunk = 32
 [output.ao]
 path = "out/ao.zarr"
 from = "ao"
@@ -140,9 +161,12 @@ path = "out/light.raw"
 from = "light"
 "#;
 
-const OUTPUTS: [&str; 11] = [
+const OUTPUTS: [&str; 14] = [
     "stats.zarr",
     "extremes.zarr",
+    "shares.zarr",
+    "between.zarr",
+    "wide.zarr",
     "ao.zarr",
     "rank.npy",
     "bell.zarr",

@@ -4,7 +4,7 @@
 mod stress_fields;
 
 use occlude::grid::DType;
-use stress_fields::{METHODS, STATISTICS, Worst, fields, functions, measure, measure_gaussian};
+use stress_fields::{METHODS, STATISTICS, Worst, counted, fields, functions, measure, measure_gaussian};
 
 /// Fields and their worst errors.
 fn each(test: impl Fn(&fields::Field, &Worst)) {
@@ -37,6 +37,20 @@ fn every_field_keeps_the_promised_bounds() {
             }
         }
     });
+}
+
+#[test]
+fn counts_are_right_and_lie_between_their_bounds() {
+    let mut width = 0.0;
+    for field in fields::all() {
+        let found = counted::measure(&field);
+        let name = format!("{} ({})", field.name, field.dtype);
+        assert!(found.samples > 20 && found.levels <= 1e-6, "{name}: levels off by {:e}", found.levels);
+        assert_eq!(found.outside, 0, "{name}: exact counts outside their bounds");
+        assert!(found.middle <= found.width, "{name}: {} off between bounds of width {}", found.middle, found.width);
+        width += found.width / fields::all().len() as f64;
+    }
+    assert!(width < 0.4, "bounds of width {width} say little");
 }
 
 #[test]

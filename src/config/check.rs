@@ -4,7 +4,7 @@ use std::path::{Component, Path, PathBuf};
 
 use super::section::error;
 use super::{Config, InputKind, Op, Output, OutputDType, OutputRange, Place, Ref, StageNode, op_channels};
-use crate::stage::Reduce;
+use crate::stage::{Method, Reduce};
 use crate::{Error, Result};
 
 /// Everything that a config can be refused for after its tables have been read.
@@ -12,7 +12,7 @@ pub fn check(config: &Config) -> Result<()> {
     cycles(config)?;
     for stage in &config.stages {
         for (key, reference) in stage.reads() {
-            colour_exists(config, reference).map_err(|m| stage.place.error(key, m))?;
+            channel_exists(config, reference).map_err(|m| stage.place.error(key, m))?;
         }
     }
     if config.outputs.is_empty() {
@@ -125,12 +125,19 @@ fn cycles(config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// `rgb` of an obscurance stage exists only with `colour`.
-fn colour_exists(config: &Config, reference: &Ref) -> Result<(), String> {
+/// `rgb` of an obscurance stage exists only with `colour`, bounds of an openness only with `method = "moments4"`.
+fn channel_exists(config: &Config, reference: &Ref) -> Result<(), String> {
     let stage = config.stage(&reference.name);
     match (stage.map(|s| &s.op), reference.channel.as_deref()) {
         (Some(Op::Obscurance(o)), Some("rgb")) if o.colour.is_none() => {
             Err(format!("stage {:?} has channel rgb only with its key `colour`", reference.name))
+        }
+        (Some(Op::AmbientOcclusion { method, .. }), Some(bound @ ("lower" | "upper")))
+            if *method != Method::Moments4 =>
+        {
+            let word = super::stages::method_word(*method);
+            let name = &reference.name;
+            Err(format!("stage {name:?} has no channel {bound:?} with method {word:?}; method \"moments4\" has it"))
         }
         _ => Ok(()),
     }
@@ -138,7 +145,7 @@ fn colour_exists(config: &Config, reference: &Ref) -> Result<(), String> {
 
 fn check_output(config: &Config, output: &Output) -> Result<()> {
     for reference in &output.from {
-        colour_exists(config, reference).map_err(|m| output.place.error("from", m))?;
+        channel_exists(config, reference).map_err(|m| output.place.error("from", m))?;
         let Some(channel) = config.channel_of(reference) else { continue };
         let integer = matches!(output.dtype, Some(OutputDType::U8 | OutputDType::U16));
         if integer && channel != "openness" && output.range == OutputRange::Unset {

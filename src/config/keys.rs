@@ -59,7 +59,9 @@ pub fn op_channels(op: &str) -> &'static [&'static str] {
     match op {
         "box" => &["mean", "min", "max", "variance", "std", "moment2"],
         "gaussian" | "occlusion_map" => &["mean", "variance"],
-        "ambient_occlusion" | "window" => &["openness"],
+        // The bounds are of method moments4 only.
+        "ambient_occlusion" => &["openness", "lower", "upper"],
+        "window" => &["openness"],
         "obscurance" => &["openness", "rgb"],
         "transfer" => &["opacity", "rgb"],
         "opacity_modulation" => &["opacity"],
@@ -72,7 +74,7 @@ pub fn op_channels(op: &str) -> &'static [&'static str] {
 }
 
 pub(super) const METHODS: &[&str] =
-    &["exact", "cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal", "beta", "levels"];
+    &["exact", "cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal", "beta", "moments4", "levels"];
 pub(super) const FORMATS: &[&str] =
     &["ome-zarr-0.5", "ome-zarr-0.4", "nrrd", "nii", "npy", "raw", "0.5", "0.4", "zarr3", "zarr2", "nifti"];
 /// Fields that `synthetic` names; the store makes them.
@@ -153,7 +155,7 @@ pub const KEYS: &[Key] = &[
     stage(&["combine"], "inputs", Kind::Refs, Required, "what it reads, all of one shape"),
     stage(&["combine"], "input", Kind::Refs, Absent("inputs is given"), "another name of `inputs`"),
     stage(NO_OPS, "where", Kind::Where, Absent("everywhere"), "which voxels are needed"),
-    stage(NO_OPS, "fill", Kind::AnyNumber, Absent("1 for openness, else 0"), "value of voxels that `where` excludes"),
+    stage(NO_OPS, "fill", Kind::AnyNumber, Absent("1 for openness and its bounds, else 0"), "value of voxels that `where` excludes"),
     stage(WINDOWED, "border", Kind::Border, Toml("\"clip\""), "what a window sees beyond the edge of the volume; a constant is in scaled units"),
     stage(&["occlusion_map"], "border", Kind::Choice(&["clip"]), Toml("\"clip\""), "weights are renormalised at the edge"),
     stage(REGRESSION, "border", Kind::Choice(&["nearest"]), Toml("\"nearest\""), "the regression repeats the edge"),

@@ -52,6 +52,9 @@ pub fn stage_constants(op: &Op) -> Value {
             if *method == Method::CdfPower {
                 constants.insert("beta".into(), json!([1e-6, 1e6]));
             }
+            if *method == Method::Moments4 {
+                constants.insert("code_bits".into(), json!(16));
+            }
             if *region == AoRegion::EqualVolume {
                 constants.insert("equal_volume_factor".into(), json!(0.806));
             }

@@ -93,18 +93,26 @@ fn solid_low(r: &Reader) -> Result<bool> {
     r.choice("solid", &[("high", false), ("low", true)])
 }
 
+/// Values of `method`.
+const METHODS: [(&str, Method); 8] = [
+    ("exact", Method::Exact),
+    ("cdf_power", Method::CdfPower),
+    ("gaussian_cdf", Method::GaussianCdf),
+    ("chebyshev", Method::Chebyshev),
+    ("chebyshev_literal", Method::ChebyshevLiteral),
+    ("beta", Method::Beta),
+    ("moments4", Method::Moments4),
+    ("levels", Method::Levels),
+];
+
+/// A method as the config writes it.
+pub fn method_word(method: Method) -> &'static str {
+    METHODS.iter().find(|(_, m)| *m == method).map_or("", |(word, _)| word)
+}
+
 fn ambient_occlusion(r: &Reader, input: Ref) -> Result<Op> {
-    let methods = [
-        ("exact", Method::Exact),
-        ("cdf_power", Method::CdfPower),
-        ("gaussian_cdf", Method::GaussianCdf),
-        ("chebyshev", Method::Chebyshev),
-        ("chebyshev_literal", Method::ChebyshevLiteral),
-        ("beta", Method::Beta),
-        ("levels", Method::Levels),
-    ];
     let regions = [("box", AoRegion::Box), ("equal_volume", AoRegion::EqualVolume), ("ball", AoRegion::Ball)];
-    let method = r.choice("method", &methods)?;
+    let method = r.choice("method", &METHODS)?;
     let region = r.choice("region", &regions)?;
     if region == AoRegion::Ball && method != Method::Exact {
         return Err(r.error("region", "\"ball\" is for method \"exact\" only; expected \"box\" or \"equal_volume\""));

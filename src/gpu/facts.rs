@@ -33,6 +33,9 @@ pub const BETA: &str = "no GPU kernel for method \"beta\": runs on the CPU";
 /// Why quantile levels stay on the CPU.
 pub const LEVELS: &str = "no GPU kernel for method \"levels\": runs on the CPU";
 
+/// Why four moments stay on the CPU: sums of fourth powers take 96 bits, and bounds of their rounding f64.
+pub const MOMENTS4: &str = "no GPU kernel for method \"moments4\", whose guarantee takes f64: runs on the CPU";
+
 /// Bricks that are on the GPU's way at once: one is packed, one computes, one is read back and finished.
 pub const SLOTS: u64 = 3;
 
@@ -51,6 +54,9 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
     }
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Levels, _))) {
         return Err(LEVELS);
+    }
+    if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Moments4, _))) {
+        return Err(MOMENTS4);
     }
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Beta, _))) {
         return Err(BETA);
@@ -110,6 +116,7 @@ mod tests {
         assert_eq!(window(DType::U8, false, &open(Method::Beta)), Err(BETA));
         assert_eq!(window(DType::U8, false, &open(Method::Exact)), Err(EXACT));
         assert_eq!(window(DType::U8, false, &open(Method::Levels)), Err(LEVELS));
+        assert_eq!(window(DType::U8, false, &open(Method::Moments4)), Err(MOMENTS4));
         assert_eq!(window(DType::U8, false, &open(Method::CdfPower)), Ok(()));
     }
 }

@@ -13,6 +13,7 @@ pub(crate) mod hostile;
 pub mod lanes;
 pub mod levels;
 pub mod mask;
+pub mod moments4;
 pub mod obscurance;
 pub mod occlusion_map;
 pub mod pointwise;

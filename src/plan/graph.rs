@@ -5,7 +5,7 @@ use crate::config::WhereRule;
 use crate::grid::{Affine, Border, DType};
 use crate::kernel::obscurance::ObscuranceParams;
 use crate::stage::{
-    CombineKind, GradientWeight, Ties, TransferPoint, WindowChannel, WindowMode, WindowParams, WindowShape,
+    Bound, CombineKind, GradientWeight, Ties, TransferPoint, WindowChannel, WindowMode, WindowParams, WindowShape,
 };
 
 /// Index into [`Graph::wires`].
@@ -104,6 +104,14 @@ pub enum StepKind {
         params: WindowParams,
         levels: GlobalId,
         ties: Ties,
+    },
+    /// Openness and its bounds from four power moments.
+    Moments4 {
+        params: WindowParams,
+        /// Levels from which codes are made, where the type is wider than 16 bits.
+        codes: Option<GlobalId>,
+        ties: Ties,
+        channels: Vec<Bound>,
     },
     Gaussian {
         sigma: [f64; 3],
@@ -238,6 +246,7 @@ impl StepKind {
             StepKind::Window { .. } => "window",
             StepKind::Rank { .. } => "rank",
             StepKind::Levels { .. } => "levels",
+            StepKind::Moments4 { .. } => "moments4",
             StepKind::Gaussian { .. } => "gaussian",
             StepKind::Gradient { .. } => "gradient",
             StepKind::Transfer { .. } => "transfer",

@@ -1,14 +1,16 @@
 //! Config and volume facts to a pruned graph: names become indices, lengths become voxels, stages that share a pass share
 //! a step.
 
+mod openness;
+
 use std::collections::HashMap;
 
 use super::graph::*;
 use super::{Prepass, PrepassKind, lengths};
-use crate::config::{AoRegion, Config, Input, Modulation, Op, Place, Ref, StageNode, Where, WhereRule, op_channels};
+use crate::config::{Config, Input, Modulation, Op, Place, Ref, StageNode, Where, WhereRule, op_channels};
 use crate::grid::{Affine, Border, DType};
 use crate::kernel::{gaussian, mask, obscurance};
-use crate::stage::{GradientWeight, Method, WindowChannel, WindowParams, WindowShape};
+use crate::stage::{GradientWeight, WindowChannel, WindowParams};
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 
@@ -199,28 +201,7 @@ impl Lowering<'_> {
                 let channels = wanted.iter().map(|c| (*c, box_channel(c))).collect();
                 self.window(index, node, src, radius, false, channels)
             }
-            Op::AmbientOcclusion { input, radius, method, ties, region, solid_low, level_count } => {
-                let src = self.wire(input, place)?;
-                let mut radius = lengths::radius(radius, self.lattice(src), &key("radius"))?;
-                if *region == AoRegion::EqualVolume {
-                    radius = lengths::equal_volume(radius);
-                }
-                self.check_window(src, radius, node.border, &key("radius"))?;
-                if *method == Method::Exact {
-                    let shape = if *region == AoRegion::Ball { WindowShape::Ball } else { WindowShape::Box };
-                    let params = self.window_params(src, radius, *solid_low);
-                    let kind = StepKind::Rank { params, shape, ties: *ties };
-                    return self.push_step(index, node, kind, vec![src], radius, node.border, wanted);
-                }
-                if *method == Method::Levels {
-                    let params = self.window_params(src, radius, *solid_low);
-                    let kind = PrepassKind::Levels { count: *level_count, flipped: params.flipped() };
-                    let kind = StepKind::Levels { params, levels: self.prepass(src, kind), ties: *ties };
-                    return self.push_step(index, node, kind, vec![src], radius, node.border, wanted);
-                }
-                let channels = vec![("openness", WindowChannel::Openness(*method, *ties))];
-                self.window(index, node, src, radius, *solid_low, channels)
-            }
+            Op::AmbientOcclusion { .. } => self.openness(index, node, wanted),
             Op::Gaussian { input, sigma } => {
                 let src = self.wire(input, place)?;
                 let sigma = lengths::sigma(sigma, self.lattice(src), &key("sigma"))?;
@@ -580,7 +561,7 @@ impl Lowering<'_> {
             dtype,
             affine: Affine::IDENTITY,
             missing,
-            fill: node.fill.unwrap_or(if channel == "openness" { 1.0 } else { 0.0 }),
+            fill: node.fill.unwrap_or(if ["openness", "lower", "upper"].contains(&channel) { 1.0 } else { 0.0 }),
             lattice: src.lattice,
             halo: [0; 3],
         };

@@ -5,7 +5,7 @@ use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
 use crate::gpu::{facts, passes, record, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
-use crate::kernel::{gaussian, gradient, levels, obscurance, rank, reduce, window};
+use crate::kernel::{gaussian, gradient, levels, moments4, obscurance, rank, reduce, window};
 
 /// What the program itself, thread stacks and the allocator's slack take of the ceiling.
 pub const FIXED: u64 = 16 << 20;
@@ -78,6 +78,7 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Window { params, channels } => window::scratch_bytes(dtype, src, dst, params, channels),
         StepKind::Rank { params, shape, .. } => rank::scratch_bytes(dtype, src, dst, params, *shape),
         StepKind::Levels { params, .. } => levels::scratch_bytes(dtype, src, dst, params),
+        StepKind::Moments4 { params, .. } => moments4::scratch_bytes(dtype, src, dst, params),
         StepKind::Gaussian { sigma, channels } => gaussian::scratch_bytes(dtype, src, dst, *sigma, channels.len() > 1),
         StepKind::Gradient { size, .. } => gradient::scratch_bytes(dtype, src, dst, *size),
         StepKind::Obscurance { params, colour, normal, .. } => {
@@ -140,7 +141,7 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
 }
 
 /// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.
-fn window_dtype(dtype: DType, border: Border) -> DType {
+pub(super) fn window_dtype(dtype: DType, border: Border) -> DType {
     match border {
         Border::Constant(_) => dtype.result(),
         _ => dtype,

@@ -37,7 +37,7 @@ pub enum PrepassKind {
     Max,
     /// Least and largest value (`range = "auto"`).
     MinMax,
-    /// Quantile levels (`method = "levels"`); `flipped` where smaller stored values are denser.
+    /// Quantile levels (`method = "levels"`, and the codes of `"moments4"`); `flipped` where smaller stored values are denser.
     Levels { count: usize, flipped: bool },
 }
 
@@ -174,6 +174,7 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
             return facts::obscurance(input.dtype, plain);
         }
         graph::StepKind::Levels { .. } => return Err(facts::LEVELS),
+        graph::StepKind::Moments4 { .. } => return Err(facts::MOMENTS4),
         _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
     };
     if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {

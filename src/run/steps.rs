@@ -9,10 +9,11 @@ use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
 use crate::gpu::Gpu;
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut, Voxel};
+use crate::kernel::moments4::{BoundOut, Codes};
 use crate::kernel::obscurance::Prepared;
 use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
-use crate::kernel::{Context, gaussian, gradient, levels, mask, pointwise, rank, window};
+use crate::kernel::{Context, gaussian, gradient, levels, mask, moments4, pointwise, rank, window};
 use crate::plan::Plan;
 use crate::plan::graph::{GradientChannel, Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
 use crate::stage::WindowParams;
@@ -210,7 +211,11 @@ impl<'a> Engine<'a> {
                 gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
                 src.recycle(self.pool);
             }
-            StepKind::Window { .. } | StepKind::Rank { .. } | StepKind::Levels { .. } | StepKind::Gaussian { .. } => {
+            StepKind::Window { .. }
+            | StepKind::Rank { .. }
+            | StepKind::Levels { .. }
+            | StepKind::Moments4 { .. }
+            | StepKind::Gaussian { .. } => {
                 for c in 0..input_wire.components {
                     let src = self.windowed(step, inputs[0], c, input_wire, region, volume);
                     self.windows(id, &src, &mut outputs, c, &mut cx)?;
@@ -223,7 +228,7 @@ impl<'a> Engine<'a> {
         Ok(outputs)
     }
 
-    /// Window, rank or Gaussian of one component.
+    /// A kernel of windows on one component.
     fn windows(&self, id: StepId, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) -> Result<()> {
         let step = &self.plan.graph.steps[id];
         let region = outputs[0].region;
@@ -251,6 +256,16 @@ impl<'a> Engine<'a> {
                 let params = WindowParams { missing: src.missing, ..*params };
                 let found = levels::Levels::from_numbers(&self.globals[*levels]);
                 levels::levels(src.view(), &found, &params, *ties, src.at, view_mut(&mut outputs[0], c), cx);
+            }
+            StepKind::Moments4 { params, codes, ties, channels } => {
+                let params = WindowParams { missing: src.missing, ..*params };
+                let codes = codes.map(|g| Codes::new(&levels::Levels::from_numbers(&self.globals[g])));
+                let mut outs: Vec<BoundOut> = channels
+                    .iter()
+                    .zip(outputs)
+                    .map(|(&channel, value)| BoundOut { channel, dst: view_mut(value, c) })
+                    .collect();
+                moments4::moments4(src.view(), codes.as_ref(), &params, *ties, src.at, &mut outs, cx);
             }
             StepKind::Gaussian { sigma, channels } => {
                 let (mut mean, mut variance) = (None, None);

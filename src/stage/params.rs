@@ -19,6 +19,19 @@ pub enum Method {
     Beta,
     /// Window counts at quantile levels of the whole volume, interpolated between levels.
     Levels,
+    /// Middle of the bounds that the window's first four power moments put on the count.
+    Moments4,
+}
+
+/// A result of [`Method::Moments4`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Bound {
+    /// The middle between the other two.
+    Openness,
+    /// Never above the exact count's openness.
+    Lower,
+    /// Never below it.
+    Upper,
 }
 
 /// How voxels equal to the centre count.

@@ -163,6 +163,81 @@ def halves(folder, stage, close):
     close("half codes", got, np.rint(v / 50 * 255), 0)
 
 
+def canonical(window, centre):
+    """Bounds of the numbers of voxels below `centre` and not above it: the distribution with the window's moments 0 to 4
+    that has the centre for a node, by exact fractions up to the roots. None where the moments are those of fewer points."""
+    x = [Fraction(float(v)) - Fraction(float(centre)) for v in window]
+    m = [sum(v**k for v in x) for k in range(5)]
+    rows = [[m[i + j] for j in range(3)] + [Fraction(i == 0)] for i in range(3)]  # Hankel matrix, powers of the centre: 1, 0, 0
+    for i in range(3):
+        pivot = next((r for r in range(i, 3) if rows[r][i]), None)
+        if pivot is None:
+            return None
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        rows[i] = [v / rows[i][i] for v in rows[i]]
+        for r in (r for r in range(3) if r != i):
+            rows[r] = [a - rows[r][i] * b for a, b in zip(rows[r], rows[i])]
+    c = [row[3] for row in rows]
+    at_centre = 1 / c[0]
+    nodes = np.sort_complex(np.roots([float(v) for v in c[::-1]])).real
+    # The other weights from the first two moments.
+    weights = np.linalg.solve(np.array([nodes, nodes**2]), [float(m[1]), float(m[2])]) if len(nodes) == 2 else [0.0]
+    lower = sum(w for w, node in zip(weights, nodes) if node < 0)
+    return lower, lower + float(at_centre)
+
+
+def bounds(folder, stage, close):
+    """The exact count lies between `lower` and `upper`, which are what four moments allow, and `openness` in the middle."""
+    shape, r = (6, 7, 9), 2
+    volumes = {
+        "u8": RNG.integers(0, 256, shape).astype("u1"),
+        "u8 two values": (RNG.random(shape) < 0.3).astype("u1") * 7,
+        "u8 tail": (255 * RNG.random(shape) ** 9).astype("u1"),
+        "i16": RNG.integers(-32768, 32768, shape).astype("<i2"),
+        "u16 top": (65535 - RNG.integers(0, 9, shape)).astype("<u2"),
+        "u16 outlier": np.where(RNG.random(shape) < 0.01, 65535, RNG.integers(0, 9, shape)).astype("<u2"),
+        "f32": RNG.normal(size=shape).astype("<f4"),
+        "f64": 1e6 + RNG.normal(size=shape),
+        "i32": RNG.integers(-(2**31), 2**31, shape).astype("<i4"),
+    }
+    for name, v in volumes.items():
+        np.save(folder / "a.npy", v)
+        wide, mark = v.dtype.itemsize > 2, np.sort(v.ravel())[-3]
+        for ties, solid in itertools.product(("le", "mid"), ("high", "low")):
+            # A voxel is missing where the value marks it; slopes below 0 turn the order once more.
+            source = "path = 'a.npy'\nslope = -0.5" + ("" if v.dtype.kind == "f" else f"\nnodata = {int(mark)}")
+            gone = np.zeros(shape, bool) if v.dtype.kind == "f" else v == mark
+            body = f"op = 'ambient_occlusion'\nradius = {r}\nties = '{ties}'\nsolid = '{solid}'\nmethod = "
+            exact = stage(folder, source, body + "'exact'")
+            lower, open_, upper = (stage(folder, source, body + "'moments4'", f"s.{c}") for c in ("lower", "openness", "upper"))
+            what = f"moments4 {name} {ties} {solid}"
+            have = ~gone
+            assert (np.isnan(lower) == gone).all() and (np.isnan(open_) == gone).all(), what
+            assert (lower[have] <= exact[have]).all() and (exact[have] <= upper[have]).all(), f"{what}: a bound does not hold"
+            assert (lower[have] >= 0).all() and (upper[have] <= 1).all(), what
+            close(f"{what} middle", open_, (lower.astype(float) + upper) / 2, 1e-6)
+            if "two values" in name:
+                close(f"{what} known exactly", open_, exact, 1e-6)
+                continue
+            d = np.where(gone, np.nan, v.astype(float)) * (1 if solid == "low" else -1)
+            want = np.full((2,) + shape, np.nan)
+            for p in np.ndindex(shape):
+                w = d[tuple(slice(max(0, i - r), i + r + 1) for i in p)].ravel()
+                w = w[~np.isnan(w)]
+                found = None if gone[p] else canonical(w, d[p])
+                if found is not None:
+                    # Counts are whole, and the centre is one that is not above itself.
+                    more, less = (1, 0) if ties == "le" else (0.5, 0.5)
+                    want[0][p] = (found[0] + more) / len(w)
+                    want[1][p] = (found[1] - less) / len(w)
+            judged = ~np.isnan(want[0])
+            assert judged.mean() > 0.5, what
+            # Bounds are made whole, which is less than a voxel of 24 at least; wide types have 65535 steps.
+            one = 1 / 24 + (0.02 if wide else 0)
+            got = np.where(judged, [lower, upper], np.nan)
+            close(f"{what} bounds", got, want, one)
+
+
 def run_all(folder, stage, close):
-    for part in (weights, holes, rounded, scaled, halves):
+    for part in (weights, holes, rounded, scaled, halves, bounds):
         part(folder, stage, close)

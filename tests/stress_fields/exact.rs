@@ -45,6 +45,9 @@ pub struct Window {
     pub min: f64,
     pub max: f64,
     pub infinite: bool,
+    /// A power of two that brings the window's values near 1 where squares would leave the range of f64. What follows is in
+    /// these units.
+    scale: f64,
     mean: Twice,
     /// Mean less the centre.
     shift: f64,
@@ -88,11 +91,16 @@ impl Window {
         let (min, max) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |m, v| (m.0.min(*v), m.1.max(*v)));
         if min.is_infinite() || max.is_infinite() {
             let mean = values.iter().sum::<f64>();
-            let (mean, shift) = (Twice(mean, 0.0), f64::NAN);
-            let w =
-                Window { centre, min, max, infinite: true, mean, shift, variance: f64::NAN, moment2: f64::INFINITY };
-            return Some(w);
+            let (mean, shift, scale) = (Twice(mean, 0.0), f64::NAN, 1.0);
+            let (variance, moment2) = (f64::NAN, f64::INFINITY);
+            return Some(Window { centre, min, max, infinite: true, scale, mean, shift, variance, moment2 });
         }
+        let scale = match max.abs().max(min.abs()) {
+            size if size > 1e120 => 2f64.powi(-600),
+            size if size < 1e-120 => 2f64.powi(600),
+            _ => 1.0,
+        };
+        let values: Vec<f64> = values.iter().map(|v| v * scale).collect();
         let sum = |f: &dyn Fn(f64) -> Twice| values.iter().fold(Twice::default(), |s, v| s.plus(f(*v)));
         let mean = sum(&|v| Twice(v, 0.0)).over(n);
         let minus = Twice(-mean.0, -mean.1);
@@ -107,20 +115,24 @@ impl Window {
             (values.len() as i128 * s2 - s1 * s1) as f64 / (n * n)
         };
         let moment2 = sum(&|v| Twice(v, 0.0).times(Twice(v, 0.0))).over(n).value();
-        let shift = mean.plus(Twice(-centre, 0.0)).value();
-        Some(Window { centre, min, max, infinite: false, mean, shift, variance, moment2 })
+        let shift = mean.plus(Twice(-centre * scale, 0.0)).value();
+        Some(Window { centre, min, max, infinite: false, scale, mean, shift, variance, moment2 })
     }
 
     pub fn mean(&self) -> f64 {
-        self.mean.value()
+        self.mean.value() / self.scale
     }
 
     pub fn variance(&self) -> f64 {
-        self.variance
+        self.variance / self.scale / self.scale
+    }
+
+    pub fn std(&self) -> f64 {
+        self.variance.sqrt() / self.scale
     }
 
     pub fn moment2(&self) -> f64 {
-        self.moment2
+        self.moment2 / self.scale / self.scale
     }
 
     /// The formula in f64 from exact moments.
@@ -137,6 +149,7 @@ impl Window {
                 (_, _, max) => f64::from(u8::from(!max)),
             };
         }
+        let [v, min, max] = [v, min, max].map(|v| v * self.scale);
         let (below, above, range) = (v - min, max - v, max - min);
         // Mean less min and max less mean, from the mean's distance to the centre.
         let (over, under) = (self.shift + below, above - self.shift);

@@ -106,6 +106,12 @@ pub fn all() -> Vec<Field> {
             1e-9 * n.normal() + if c[2] < 30 { 0.0 } else { 1e6 }
         }),
         field("1e30 + 1e18 noise", F64, SHAPE, R, |_, _, n| 1e30 + 1e18 * n.normal()),
+        field("1e200 noise", F64, SHAPE, R, |_, _, n| 1e200 * n.normal()),
+        field("1e-200 noise", F64, SHAPE, R, |_, _, n| 1e-200 * n.normal()),
+        field("1e-160 + 1e-170 noise", F64, SHAPE, R, |_, _, n| 1e-160 + 1e-170 * n.normal()),
+        field("alternating +-1.7e308", F64, SHAPE, R, |i, _, _| if i % 2 == 0 { 1.7e308 } else { -1.7e308 }),
+        field("denormals", F64, SHAPE, R, |i, _, _| (i % 7) as f64 * 5e-324),
+        field("1e300 beside 1e-300", F64, SHAPE, R, |_, c, n| n.normal() * if c[2] < 30 { 1e300 } else { 1e-300 }),
         field("noise", U8, SHAPE, R, |_, _, n| (n.bits() % 256) as f64),
         field("noise, radius 64", U8, [40, 40, 40], [64; 3], |_, _, n| (n.bits() % 256) as f64),
         field("all -128", I8, SHAPE, R, |_, _, _| -128.0),

@@ -152,7 +152,7 @@ pub fn estimator(method: Method) -> Estimator {
         Method::GaussianCdf => Estimator::Spread(Spread::Gaussian),
         Method::Chebyshev => Estimator::Spread(Spread::Chebyshev),
         Method::ChebyshevLiteral => Estimator::Spread(Spread::Literal),
-        Method::Exact | Method::Levels => unreachable!("refused when the needs were worked out"),
+        Method::Exact | Method::Levels | Method::Moments4 => unreachable!("refused when the needs were worked out"),
     }
 }
 

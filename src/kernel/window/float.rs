@@ -15,7 +15,7 @@ use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};
 use super::parts::{BLOCK, Weights};
 use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
-use super::{Context, Place, WindowOut};
+use super::{Place, WindowOut};
 use crate::grid::{AnyViewMut, Shape, View};
 use crate::kernel::lanes::LANES;
 use crate::kernel::simd::Level;
@@ -103,23 +103,23 @@ fn any_nan_inner<T: Float>(row: &[T]) -> bool {
     row.iter().fold(false, |any, v| any | (*v != *v))
 }
 
-/// Runs every tile of a call.
+/// Runs every tile of a call, with [`bytes`] of scratch.
 pub fn run<T: Float>(
     src: View<T>,
     params: &WindowParams,
     place: Place,
     dst: Shape,
     outs: &mut [WindowOut],
-    cx: &mut Context,
+    level: Level,
+    bytes: &mut [u8],
 ) {
     let needs = Needs::of(outs.iter().map(|o| o.channel), true);
     let job = &Job::new(src.shape, dst, place, params, needs, plan::batch_bytes(T::DTYPE, needs));
     assert!(job.counts().0 < 1 << 31, "windows of {} voxels", job.counts().0);
-    let level = cx.level;
     let rows = (0..src.shape[0]).flat_map(|z| (0..src.shape[1]).map(move |y| (z, y)));
     let counts = rows.into_iter().any(|(z, y)| any_nan(level, src.row_at(z, y)));
     let wanted = Wanted { pairs: T::Total::PAIR, variance: needs.variance, counts };
-    let bytes = &mut cx.scratch.take(bytes::<T>(job));
+    let bytes = &mut &mut *bytes;
     let mut emit = Emit::new(outs, params, level, job.tile[1], bytes);
     let mut lines = Lines::new(job, cut::<T>(bytes, Lines::<T>::len(job)));
     // Sums without counts take what does not exist as 0, others as missing.

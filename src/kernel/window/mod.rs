@@ -15,6 +15,7 @@ mod emit;
 mod estimate;
 mod exact;
 mod extremes;
+mod far;
 pub mod finish;
 mod float;
 mod float_estimate;
@@ -90,8 +91,14 @@ pub fn window(src: AnyView, params: &WindowParams, place: Place, outs: &mut [Win
         AnyView::I16(v) => integers::<i16, u16>(v, 1 << 15, params, place, dst, outs, cx),
         AnyView::U32(v) => integers::<u32, u32>(v, 0, params, place, dst, outs, cx),
         AnyView::I32(v) => integers::<i32, u32>(v, 1 << 31, params, place, dst, outs, cx),
-        AnyView::F32(v) => float::run(v, params, place, dst, outs, cx),
-        AnyView::F64(v) => float::run(v, params, place, dst, outs, cx),
+        AnyView::F32(v) => {
+            let channels = outs.iter().map(|o| o.channel);
+            let needs = Needs::of(channels, true);
+            let job = Job::new(v.shape, dst, place, params, needs, plan::batch_bytes(DType::F32, needs));
+            let bytes = cx.scratch.take(float::bytes::<f32>(&job));
+            float::run(v, params, place, dst, outs, cx.level, bytes)
+        }
+        AnyView::F64(v) => far::run(v, params, place, dst, outs, cx),
     }
 }
 
@@ -109,7 +116,7 @@ pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams
         DType::U16 | DType::I16 => int_bytes::<u16>(&job, masked),
         DType::U32 | DType::I32 => int_bytes::<u32>(&job, masked),
         DType::F32 => float::bytes::<f32>(&job),
-        DType::F64 => float::bytes::<f64>(&job),
+        DType::F64 => far::bytes(src, dst, params, channels.iter().copied()),
     }
 }
 

@@ -28,8 +28,8 @@ impl Needs {
                 WindowChannel::Variance | WindowChannel::Std | WindowChannel::Moment2 => {
                     (needs.mean, needs.variance) = (true, true)
                 }
-                WindowChannel::Openness(Method::Exact | Method::Levels, _) => {
-                    panic!("openness by counting has kernels of its own")
+                WindowChannel::Openness(Method::Exact | Method::Levels | Method::Moments4, _) => {
+                    panic!("these methods have kernels of their own")
                 }
                 WindowChannel::Openness(Method::CdfPower, _) => (needs.extremes, needs.mean) = (true, true),
                 WindowChannel::Openness(Method::Beta, _) => {

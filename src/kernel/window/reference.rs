@@ -91,7 +91,7 @@ pub fn voxel<T: Voxel>(src: View<T>, c: [usize; 3], params: &WindowParams, chann
                     let k = (share * (above - mean) * range / variance - 1.0).clamp(1e-9, 1e8);
                     beta(below / range, share * k, (above - mean) / range * k)
                 }
-                Method::Exact | Method::Levels => panic!("openness by counting has kernels of its own"),
+                Method::Exact | Method::Levels | Method::Moments4 => panic!("has a kernel of its own"),
             }
         }
     }
