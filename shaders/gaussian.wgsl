@@ -1,9 +1,8 @@
 // Truncated Gaussian mean along one axis: c + sum_k w_k ((a_k + b_k) - 2 c), where a_k and b_k stand k steps before and
 // after the centre c, or are c where they do not exist. One thread makes one output.
 //
-// Agrees bit for bit with src/kernel/gaussian (mean_row in f32), since every operation is rounded by itself: `alone` hides
-// a result from the compiler behind integers, so that no product can be fused into the sum after it. Where a driver rounds
-// otherwise the lane finds out before it is used (src/gpu/gaussian.rs, probe). Weights come from the CPU, in f64 and rounded.
+// Agrees bit for bit with src/kernel/gaussian (mean_row in f32), since every operation is rounded by itself
+// (floats.wgsl). Weights come from the CPU, in f64 and rounded.
 // Parameters: src/gpu/taps.rs, struct Taps.
 // Bindings, group 0: 0 uniform Taps; 1 storage, read: packed voxels (`first`) or bits of f32 (`next`); 2 storage, written:
 // bits of f32; 3 storage, read: bits of f32 weights, `radius` for each output along the axis.
@@ -37,17 +36,11 @@ struct Taps {
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> weights: array<u32>;
 
-fn alone(v: f32) -> f32 {
-    return bitcast<f32>(bitcast<u32>(v) ^ p.zero);
-}
-
 fn value(index: u32, packed: bool) -> f32 {
     if !packed {
         return bitcast<f32>(input[index]);
     }
-    let bits = 32u >> p.packing;
-    let slot = index & ((1u << p.packing) - 1u);
-    let code = (input[index >> p.packing] >> (slot * bits)) & (0xffffffffu >> (32u - bits));
+    let code = unpacked(input[index >> p.packing], index, p.packing);
     return f32(i32(code ^ p.sign) - i32(p.sign));
 }
 
@@ -96,11 +89,11 @@ fn mean(thread: u32, packed: bool) {
 @compute @workgroup_size(64)
 fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
          @builtin(local_invocation_index) local: u32) {
-    mean((group.y * groups.x + group.x) * 64u + local, true);
+    mean(thread_of(group, groups, local), true);
 }
 
 @compute @workgroup_size(64)
 fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    mean((group.y * groups.x + group.x) * 64u + local, false);
+    mean(thread_of(group, groups, local), false);
 }

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `facts` | what the planner knows of an adapter; which stages have kernels |
 //! | `record` | the device's work as data: buffers, dispatches, what comes back |
+//! | `shaders` | their texts, put together of what they share |
 //! | `passes`, `sweep`, `taps` | windows, obscurance and Gaussians recorded, cut into parts that fit |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
@@ -19,6 +20,7 @@ mod gaussian;
 mod obscurance;
 pub mod passes;
 pub mod record;
+pub mod shaders;
 mod slot;
 pub mod sweep;
 pub mod taps;

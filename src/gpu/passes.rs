@@ -23,11 +23,12 @@ pub struct Pass {
     pub blocks: u32,
     pub block: u32,
     pub along: u32,
-    pub shift: u32,
+    pub packing: u32,
     pub flip: u32,
     pub square: u32,
     pub threads: u32,
-    pub spare: [u32; 2],
+    pub phase: u32,
+    pub zero: u32,
 }
 
 /// A quantity that the device makes for every window.
@@ -165,7 +166,7 @@ impl Job {
             out_i: 1,
             out_j: nx,
             lines: nx,
-            shift: if self.voxel == 1 { 2 } else { 1 },
+            packing: if self.voxel == 1 { 2 } else { 1 },
             flip: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
             square: matches!(quantity, Quantity::Sum { square: true, .. }) as u32,
             ..axis(0)

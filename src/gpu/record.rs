@@ -1,64 +1,14 @@
 //! What the device does with one part of a brick, as data: buffers, dispatches and what comes back. Recording asks for no
 //! device, so that tests can look at it without one.
 
+pub use super::shaders::Shader;
+
 /// Bytes between the parameters of dispatches in their buffer (the largest alignment that an adapter may ask for).
 pub const PARAMS_STRIDE: u64 = 256;
 /// Room for time stamps behind the results.
 pub const STAMP_BYTES: u64 = 256;
 /// Threads of a workgroup; in every shader.
 pub const GROUP: u32 = 64;
-
-/// The shaders, each with its text and entry points.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Shader {
-    Extremes,
-    Sums32,
-    Sums64,
-    Obscurance,
-    Gaussian,
-}
-
-impl Shader {
-    pub const ALL: [Shader; 5] =
-        [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance, Shader::Gaussian];
-
-    /// Name of its file under `shaders/`, without the ending.
-    pub fn name(self) -> &'static str {
-        match self {
-            Shader::Extremes => "window_extremes",
-            Shader::Sums32 => "window_sums32",
-            Shader::Sums64 => "window_sums64",
-            Shader::Obscurance => "obscurance",
-            Shader::Gaussian => "gaussian",
-        }
-    }
-
-    pub fn text(self) -> &'static str {
-        match self {
-            Shader::Extremes => include_str!("../../shaders/window_extremes.wgsl"),
-            Shader::Sums32 => include_str!("../../shaders/window_sums32.wgsl"),
-            Shader::Sums64 => include_str!("../../shaders/window_sums64.wgsl"),
-            Shader::Obscurance => include_str!("../../shaders/obscurance.wgsl"),
-            Shader::Gaussian => include_str!("../../shaders/gaussian.wgsl"),
-        }
-    }
-
-    pub fn entries(self) -> &'static [&'static str] {
-        match self {
-            Shader::Obscurance => &["sweep"],
-            _ => &["first", "next"],
-        }
-    }
-
-    /// Storage bindings after the uniform one: read, written, read, written, as many of them as the shader has.
-    pub fn bindings(self) -> usize {
-        match self {
-            Shader::Obscurance => 4,
-            Shader::Gaussian => 3,
-            _ => 2,
-        }
-    }
-}
 
 /// Device buffers of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

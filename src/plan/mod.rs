@@ -203,15 +203,7 @@ fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement
     let found = match config.run.device {
         Device::Cpu => None,
         Device::Auto => any.then(find),
-        Device::Gpu | Device::GpuSoftware => {
-            let facts = find().map_err(|why| {
-                let name = if config.run.device == Device::Gpu { "gpu" } else { "gpu:software" };
-                Error::Failed(format!(
-                    "run.device: \"{name}\" was asked for, and no such GPU can be used: {why}; use device = \"cpu\" or \"auto\""
-                ))
-            })?;
-            Some(Ok(facts))
-        }
+        Device::Gpu | Device::GpuSoftware => Some(Ok(find().map_err(|why| no_such_gpu(config, &why))?)),
     };
     let place = |s: &graph::Step| match (&found, supported(s)) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
@@ -225,6 +217,20 @@ fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement
         graph.steps.iter().map(|s| (s, place(s))).map(|(s, p)| (s.stages.join("+"), p.0, p.1)).collect();
     let used = places.iter().any(|p| p.1 == "gpu");
     Ok((places, found.and_then(|f| f.ok()).filter(|_| used)))
+}
+
+/// A GPU that was demanded and is not there: the file and line that ask for it, what was found, what would be accepted. The
+/// config is right where there is such a GPU, so that it is the run that fails.
+fn no_such_gpu(config: &Config, why: &str) -> Error {
+    let (name, other) = match config.run.device {
+        Device::GpuSoftware => ("gpu:software", "gpu"),
+        _ => ("gpu", "gpu:software"),
+    };
+    let message = format!(
+        "\"{name}\" was asked for, and no such GPU can be used: {why}; accepted here: \"cpu\", \"auto\" (the CPU where \
+         there is no GPU) or \"{other}\" with such a driver"
+    );
+    Error::Failed(config.locate(Error::config("run.device", message)).to_string())
 }
 
 /// Windows of equal voxel radius on unequal spacing are long in space: say so.

@@ -215,6 +215,7 @@ fn placement_follows_the_device_and_says_why() {
         let error = plan_with(&format!("run.device='{device}'"), none()).unwrap_err();
         assert_eq!(error.exit_code(), 1);
         assert!(error.to_string().contains("looked for a driver") && error.to_string().contains(device), "{error}");
+        assert!(error.to_string().contains("config.toml") && error.to_string().contains("accepted here"), "{error}");
     }
 }
 
@@ -228,6 +229,14 @@ fn without_a_driver_gpu_fails_and_auto_runs_on_the_cpu_and_says_so() {
         let out = c.arg("run").arg(dir.path().join("config.toml")).args(["--device", device]).output().unwrap();
         (out.status.code(), String::from_utf8_lossy(&out.stderr).into_owned())
     };
+    let named = CONFIG.replacen("threads = 2", "threads = 2\ndevice = \"gpu\"", 1);
+    std::fs::write(dir.path().join("named.toml"), named).unwrap();
+    let mut c = Command::new(program());
+    c.env("VK_DRIVER_FILES", "/nowhere.json").env("VK_ICD_FILENAMES", "/nowhere.json");
+    let out = c.arg("plan").arg(dir.path().join("named.toml")).output().unwrap();
+    let text = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert_eq!(out.status.code(), Some(1), "{text}");
+    assert!(text.contains("named.toml:4: run.device: \"gpu\" was asked for"), "the key's file and line: {text}");
     for device in ["gpu", "gpu:software"] {
         let (code, text) = command(device);
         assert_eq!(code, Some(1), "{text}");
