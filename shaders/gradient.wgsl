@@ -54,6 +54,24 @@ fn value(index: u32) -> f32 {
     return f32(i32(code ^ p.sign) - i32(p.sign));
 }
 
+// The voxels of a plane at +y +x, +y -x, -y +x, -y -x. Where an offset is 0 both sides are one voxel: its weight along that
+// axis is 0, and the weights along the others are shared between the sides.
+fn corners(at: u32, row: u32, dx: u32) -> vec4<f32> {
+    var c = vec4<f32>(value(at + row + dx));
+    if dx > 0u {
+        c.y = value(at + row - dx);
+    }
+    c = c.xyxy;
+    if row > 0u {
+        c.z = value(at - row + dx);
+        c.w = c.z;
+        if dx > 0u {
+            c.w = value(at - row - dx);
+        }
+    }
+    return c;
+}
+
 fn weight(component: u32, dz: u32, dy: u32, dx: u32) -> f32 {
     return bitcast<f32>(weights[((component * 3u + dz) * 3u + dy) * 3u + dx]);
 }
@@ -87,22 +105,14 @@ fn slopes(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
     for (var dz = 0u; dz <= p.half; dz += 1u) {
         for (var dy = 0u; dy <= p.half; dy += 1u) {
             for (var dx = 0u; dx <= p.half; dx += 1u) {
-                let up = centre + dz * p.in_z;
-                let down = centre - dz * p.in_z;
-                let row = dy * p.in_y;
-                // By their side of the centre along z, y, x: + and -. Where an offset is 0 both sides are one voxel, whose
-                // weight is 0 along that axis, and which counts half along the others.
-                let ppp = value(up + row + dx);
-                let ppm = value(up + row - dx);
-                let pmp = value(up - row + dx);
-                let pmm = value(up - row - dx);
-                let mpp = value(down + row + dx);
-                let mpm = value(down + row - dx);
-                let mmp = value(down - row + dx);
-                let mmm = value(down - row - dx);
-                let odd_z = ((ppp - mpp) + (ppm - mpm)) + ((pmp - mmp) + (pmm - mmm));
-                let odd_y = ((ppp - pmp) + (ppm - pmm)) + ((mpp - mmp) + (mpm - mmm));
-                let odd_x = ((ppp - ppm) + (pmp - pmm)) + ((mpp - mpm) + (mmp - mmm));
+                let u = corners(centre + dz * p.in_z, dy * p.in_y, dx);
+                var d = u;
+                if dz > 0u {
+                    d = corners(centre - dz * p.in_z, dy * p.in_y, dx);
+                }
+                let odd_z = ((u.x - d.x) + (u.y - d.y)) + ((u.z - d.z) + (u.w - d.w));
+                let odd_y = ((u.x - u.z) + (u.y - u.w)) + ((d.x - d.z) + (d.y - d.w));
+                let odd_x = ((u.x - u.y) + (u.z - u.w)) + ((d.x - d.y) + (d.z - d.w));
                 g += vec3<f32>(weight(0u, dz, dy, dx) * odd_z, weight(1u, dz, dy, dx) * odd_y,
                                weight(2u, dz, dy, dx) * odd_x);
             }

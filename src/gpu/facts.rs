@@ -85,9 +85,25 @@ pub fn gaussian(dtype: DType, missing: bool, variance: bool) -> Result<(), &'sta
     }
 }
 
-/// Why gradients stay on the CPU.
-pub const GRADIENT: &str =
-    "no GPU kernel for gradients, which the CPU sums in f64 faster than results come back: runs on the CPU";
+/// Why the normals of a sweep stay on the CPU.
+pub const NORMALS: &str =
+    "normals of a sweep come from gradients in f64, since a gradient that vanishes decides there: runs on the CPU";
+
+/// Whether gradients of this type have a GPU kernel, or why not. `normals`: a sweep weighs its directions by them.
+pub fn gradient(dtype: DType, normals: bool) -> Result<(), &'static str> {
+    match dtype {
+        _ if normals => Err(NORMALS),
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 | DType::F32 => Ok(()),
+        DType::U32 | DType::I32 | DType::F64 => Err("no GPU kernel for a gradient in f64: runs on the CPU"),
+    }
+}
+
+/// How far floats of the GPU may be from the CPU's. What is not here is the same bit for bit.
+pub mod tolerance {
+    /// Components and magnitudes of gradients, times the range of the window's values over the (least) spacing. The sums of
+    /// up to 27 products in f32: 27 * 2^-24 at worst, of weights that together are less than the inverse of the spacing.
+    pub const GRADIENT: f64 = 2e-6;
+}
 
 /// Whether obscurance of this type has a GPU kernel, or why not. `plain`: openness alone, with weights that depend on the
 /// direction only.

@@ -1,15 +1,16 @@
 //! The GPU lane through wgpu. Window sums and extremes of small integers and obscurance are exact integers, finished by the
-//! CPU kernels' own row functions, so that a GPU's results equal the CPU's bit for bit.
+//! CPU kernels' own row functions, so that a GPU's results equal the CPU's bit for bit; floats hold the tolerances that
+//! [`facts::tolerance`] states.
 //!
 //! | file | holds |
 //! |---|---|
 //! | `facts` | what the planner knows of an adapter; which stages have kernels |
 //! | `record` | the device's work as data: buffers, dispatches, what comes back |
 //! | `shaders` | their texts, put together of what they share |
-//! | `passes`, `sweep`, `taps` | windows, obscurance and Gaussians recorded, cut into parts that fit |
+//! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
-//! | `windows`, `obscurance`, `gaussian` | calls like the CPU kernels' |
+//! | `windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
 //!
 //! Everything above `device` knows no wgpu.
 
@@ -17,10 +18,12 @@ pub mod device;
 pub mod engine;
 pub mod facts;
 mod gaussian;
+mod gradient;
 mod obscurance;
 pub mod passes;
 pub mod record;
 pub mod shaders;
+pub mod slopes;
 mod slot;
 pub mod sweep;
 pub mod taps;

@@ -235,6 +235,25 @@ pub fn packed(dtype: DType) -> Option<(usize, bool)> {
     }
 }
 
+/// How voxels are uploaded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stored {
+    /// Bytes: 1, 2 or 4.
+    pub voxel: usize,
+    /// Two's complement.
+    pub signed: bool,
+    /// f32.
+    pub real: bool,
+}
+
+/// As [`packed`], with f32.
+pub fn stored(dtype: DType) -> Option<Stored> {
+    match dtype {
+        DType::F32 => Some(Stored { voxel: 4, signed: false, real: true }),
+        _ => packed(dtype).map(|(voxel, signed)| Stored { voxel, signed, real: false }),
+    }
+}
+
 /// Boxes (first voxel, extent) that tile `shape` and fit: halves along z first. `None` where even one voxel does not fit.
 pub fn cut(shape: Shape, fits: impl Fn([usize; 3], Shape) -> bool) -> Option<Vec<([usize; 3], Shape)>> {
     let mut open = vec![([0; 3], shape)];

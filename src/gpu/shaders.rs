@@ -24,11 +24,12 @@ pub enum Shader {
     Sums64,
     Obscurance,
     Gaussian,
+    Gradient,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 5] =
-        [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance, Shader::Gaussian];
+    pub const ALL: [Shader; 6] =
+        [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance, Shader::Gaussian, Shader::Gradient];
 
     fn composed(self) -> Composed {
         match self {
@@ -37,6 +38,7 @@ impl Shader {
             Shader::Sums64 => composed!("common", "window_pass", "window_sums", "window_sums64"),
             Shader::Obscurance => composed!("common", "obscurance"),
             Shader::Gaussian => composed!("common", "floats", "gaussian"),
+            Shader::Gradient => composed!("common", "gradient"),
         }
     }
 
@@ -57,6 +59,7 @@ impl Shader {
     pub fn entries(self) -> &'static [&'static str] {
         match self {
             Shader::Obscurance => &["sweep"],
+            Shader::Gradient => &["slopes"],
             _ => &["first", "next"],
         }
     }
@@ -65,7 +68,7 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Obscurance => 4,
-            Shader::Gaussian => 3,
+            Shader::Gaussian | Shader::Gradient => 3,
             _ => 2,
         }
     }

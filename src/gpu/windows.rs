@@ -74,6 +74,7 @@ pub(super) fn pack(src: AnyView, part: &Part, pitch: usize, out: &mut wgpu::Writ
         AnyView::I8(v) => write(v, part, pitch, out),
         AnyView::U16(v) => write(v, part, pitch, out),
         AnyView::I16(v) => write(v, part, pitch, out),
+        AnyView::F32(v) => write(v, part, pitch, out),
         other => unreachable!("no job is made of {}", other.dtype()),
     }
     true

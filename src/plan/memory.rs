@@ -1,9 +1,9 @@
 //! Bytes by formula: what one brick of a given shape keeps alive at its worst moment, and what the run keeps besides.
 
-use super::graph::{Step, StepKind, WireId};
+use super::graph::{GradientChannel, Step, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan};
-use crate::gpu::{facts, passes, record, sweep, taps};
+use crate::gpu::{facts, passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, levels, obscurance, rank, reduce, window};
 
@@ -133,6 +133,11 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
         }
         StepKind::Gaussian { sigma, .. } => {
             let job = taps::TapsJob::new(dtype, src, dst, at, *sigma);
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        }
+        StepKind::Gradient { size, weight, spacing, channels, .. } => {
+            let fit = slopes::Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
+            let job = slopes::SlopesJob::new(dtype, src, dst, at, &fit, channels.contains(&GradientChannel::Vector));
             job.map_or(record::Sizes::default(), |j| j.slot(cap))
         }
         _ => record::Sizes::default(),

@@ -167,7 +167,7 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     let windows = match &step.kind {
         graph::StepKind::Window { channels, .. } => Some(channels),
         graph::StepKind::Gaussian { .. } => None,
-        graph::StepKind::Gradient { .. } => return Err(facts::GRADIENT),
+        graph::StepKind::Gradient { stored, .. } => return facts::gradient(input.dtype, *stored),
         graph::StepKind::Rank { .. } => return Err(facts::EXACT),
         graph::StepKind::Obscurance { channels, normal, .. } => {
             let plain = normal.is_none() && channels[..] == [graph::ObscuranceChannel::Openness];
@@ -191,8 +191,13 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     }
 }
 
-/// Whether a step needs [`GpuFacts::exact_floats`].
+/// Whether a step on the GPU makes floats there.
 fn floats(step: &graph::Step) -> bool {
+    matches!(step.kind, graph::StepKind::Gaussian { .. } | graph::StepKind::Gradient { .. })
+}
+
+/// Whether a step needs [`GpuFacts::exact_floats`].
+fn exact(step: &graph::Step) -> bool {
     matches!(step.kind, graph::StepKind::Gaussian { .. })
 }
 
@@ -208,7 +213,7 @@ fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement
     let place = |s: &graph::Step| match (&found, supported(s)) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
-        (Some(Ok(gpu)), Ok(())) if floats(s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if exact(s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
         (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),

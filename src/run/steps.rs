@@ -8,6 +8,7 @@ use crate::Result;
 use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
 use crate::gpu::Gpu;
+use crate::gpu::slopes::Fit;
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut, Voxel};
 use crate::kernel::obscurance::Prepared;
 use crate::kernel::simd::Level;
@@ -206,8 +207,17 @@ impl<'a> Engine<'a> {
                     }
                 }
                 let affine = if *stored { Affine::IDENTITY } else { src.affine };
-                let missing = src.missing;
-                gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
+                let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: src.missing };
+                match self.lane(id, region) {
+                    Some(gpu) => {
+                        let done = gpu.gradient(src.view(), &fit, affine, src.at, out, &mut cx);
+                        done.map_err(|e| self.gpu_failed(id, &e))?;
+                    }
+                    None => {
+                        let Fit { missing, .. } = fit;
+                        gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
+                    }
+                }
                 src.recycle(self.pool);
             }
             StepKind::Window { .. } | StepKind::Rank { .. } | StepKind::Levels { .. } | StepKind::Gaussian { .. } => {

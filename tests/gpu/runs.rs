@@ -8,7 +8,9 @@ use occlude::plan::Plan;
 use occlude::run::{RunOptions, Session, Silent};
 
 use super::adapter;
-use super::common::{assert_same, decode, metadata, mixed_u16, parse, program, run_with, u16_bytes, write_npy};
+use super::common::{
+    Decoded, assert_same, decode, metadata, mixed_u16, parse, program, run_with, u16_bytes, write_npy,
+};
 
 /// Steps that have a GPU kernel, steps that have none, borders, a mask, levels, bricks that are cut.
 const CONFIG: &str = r#"
@@ -68,6 +70,19 @@ shard = 32
 path = "out/bells.zarr"
 from = ["bells.mean", "bells.variance"]
 chunk = 16
+[stage.slope]
+op = "gradient"
+input = "vol"
+[stage.steps]
+op = "gradient"
+input = "stats.mean"
+size = 3
+weight = "inverse"
+[output.slope]
+path = "out/slope.zarr"
+from = ["slope.magnitude", "steps.vector"]
+chunk = 16
+shard = 32
 [stage.bleeding]
 op = "obscurance"
 input = "vol"
@@ -109,6 +124,50 @@ shard = 32
 const OUTPUTS: [&str; 6] = ["stats.zarr", "mirrored.zarr", "again.zarr", "exact.zarr", "swept.zarr", "bleeding.zarr"];
 const SOFTWARE: &str = "run.device='gpu:software'";
 
+/// Outputs whose floats are within a tolerance only, with the bound that their values' range gives.
+const CLOSE: [(&str, f64); 1] = [("slope.zarr", facts::tolerance::GRADIENT * 0.5 * 65535.0)];
+
+/// The first number that lies further from its twin than `bound`; NaN and infinities must be alike.
+fn far_apart(a: &Decoded, b: &Decoded, bound: f64) -> Option<String> {
+    if a.keys().ne(b.keys()) {
+        return Some("other arrays".into());
+    }
+    a.iter().zip(b.values()).find_map(|((name, (shape, a)), (other, b))| {
+        let close = |a: f64, b: f64| (a - b).abs() <= bound || a.is_nan() && b.is_nan() || a == b;
+        let values = a.iter().zip(b).map(|(a, b)| (f64::from_bits(*a), f64::from_bits(*b)));
+        let far = values.enumerate().find(|(_, (a, b))| !close(*a, *b));
+        (shape != other || far.is_some()).then(|| format!("{name}: {far:?}, {bound} is allowed"))
+    })
+}
+
+fn assert_close_outputs(what: &str, a: &Path, b: &Path) {
+    for (name, bound) in CLOSE {
+        let [a, b] = [a, b].map(|d| decode(&d.join("out").join(name)));
+        assert_eq!(far_apart(&a, &b, bound), None, "{what}: {name}");
+    }
+}
+
+#[test]
+fn the_comparison_of_floats_can_fail() {
+    let of = |v: f64| Decoded::from([("level 0".to_string(), (vec![1, 1, 2], vec![1.0f64.to_bits(), v.to_bits()]))]);
+    assert_eq!(far_apart(&of(2.0), &of(2.5), 0.5), None);
+    assert!(far_apart(&of(2.0), &of(2.6), 0.5).unwrap().contains("level 0"));
+    assert!(far_apart(&of(2.0), &of(f64::NAN), 0.5).is_some());
+    assert!(far_apart(&of(2.0), &Decoded::new(), 0.5).is_some());
+}
+
+#[test]
+fn floats_of_the_gpu_do_not_show_bricks() {
+    let Some(_) = adapter() else { return };
+    let (one, two) = (folder(), folder());
+    run_with(&parse(one.path(), CONFIG, &[SOFTWARE]), &RunOptions::default());
+    run_with(&parse(two.path(), CONFIG, &[SOFTWARE, "run.brick=[32, 16, 64]"]), &RunOptions::default());
+    for (name, _) in CLOSE {
+        let [a, b] = [&one, &two].map(|d| decode(&d.path().join("out").join(name)));
+        assert_same(name, &a, &b);
+    }
+}
+
 fn folder() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     let shape = [40, 50, 60];
@@ -132,12 +191,15 @@ fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
     run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
     let report = run_with(&parse(gpu.path(), CONFIG, &[SOFTWARE]), &RunOptions::default());
     assert_same_outputs("gpu:software", cpu.path(), gpu.path());
+    assert_close_outputs("gpu:software", cpu.path(), gpu.path());
     let device = |name: &str| report.stages.iter().find(|s| s.name == name).map(|s| s.device.clone());
     assert_eq!(device("stats").as_deref(), Some("gpu"));
     assert_eq!(device("mirrored").as_deref(), Some("gpu"));
     assert_eq!(device("swept").as_deref(), Some("gpu"));
     assert_eq!(device("floats").as_deref(), Some("gpu"));
     assert_eq!(device("bell").as_deref(), Some("gpu"));
+    assert_eq!(device("slope").as_deref(), Some("gpu"));
+    assert_eq!(device("steps").as_deref(), Some("gpu"));
     assert_eq!(device("bells").as_deref(), Some("cpu"));
     assert_eq!(device("bleeding").as_deref(), Some("cpu"));
     assert_eq!(device("again").as_deref(), Some("cpu"));
@@ -153,6 +215,7 @@ fn a_little_memory_cuts_bricks_on_the_device_and_changes_nothing() {
     let config = parse(gpu.path(), CONFIG, &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"]);
     run_with(&config, &RunOptions::default());
     assert_same_outputs("40 MiB", cpu.path(), gpu.path());
+    assert_close_outputs("40 MiB", cpu.path(), gpu.path());
 }
 
 #[test]
