@@ -127,7 +127,7 @@ impl Case {
                 let mut outs: Vec<WindowOut> =
                     outs.map(|(v, c)| WindowOut { channel: *c, dst: v.view_mut(shape) }).collect();
                 match gpu {
-                    Some(gpu) => gpu.window(src, &p, [0; 3], &mut outs, &mut cx),
+                    Some(gpu) => gpu.window(src, &p, [0; 3], [0; 3], &mut outs, &mut cx),
                     None => {
                         window(src, &p, Place::whole([0; 3]), &mut outs, &mut cx);
                         Ok(Times::default())
@@ -136,9 +136,9 @@ impl Case {
             }
             Kernel::Gaussian(sigma) => {
                 let (sigma, affine) = ([*sigma; 3], Affine::IDENTITY);
-                let mut mean = out[0].view_mut(shape);
+                let mean = out[0].view_mut(shape);
                 match gpu {
-                    Some(gpu) => gpu.gaussian(src, sigma, affine, [0; 3], &mut mean, &mut cx),
+                    Some(gpu) => gpu.gaussian(src, sigma, affine, [0; 3], Some(mean), None, &mut cx),
                     None => {
                         gaussian::gaussian(src, sigma, affine, None, [0; 3], Some(mean), None, &mut cx);
                         Ok(Times::default())

@@ -15,7 +15,12 @@ struct Slopes {
     out_x: u32,
     in_z: u32,      // strides of the input, in voxels; along x it is 1
     in_y: u32,
-    in_at: u32,     // centre of output 0
+    at_z: u32,      // centre of output 0 in the input
+    at_y: u32,
+    at_x: u32,
+    size_z: u32,    // extents of the input; voxels beyond it are those at its edge
+    size_y: u32,
+    size_x: u32,
     half: u32,      // 1 or 2
     packing: u32,   // log2 of voxels per word
     sign: u32,      // the sign bit of a packed integer, or 0
@@ -24,8 +29,7 @@ struct Slopes {
     missing: u32,   // their bits
     vector: u32,    // 1: components, 0: magnitude
     threads: u32,
-    spare_0: u32,
-    spare_1: u32,
+    table: u32,     // where the weights start
 }
 
 @group(0) @binding(0) var<uniform> p: Slopes;
@@ -54,26 +58,31 @@ fn value(index: u32) -> f32 {
     return f32(i32(code ^ p.sign) - i32(p.sign));
 }
 
-// The voxels of a plane at +y +x, +y -x, -y +x, -y -x. Where an offset is 0 both sides are one voxel: its weight along that
-// axis is 0, and the weights along the others are shared between the sides.
-fn corners(at: u32, row: u32, dx: u32) -> vec4<f32> {
-    var c = vec4<f32>(value(at + row + dx));
+// The voxels of a plane at +y +x, +y -x, -y +x, -y -x: rows and columns a step before and after the centre. Where a step is 0
+// both sides are one voxel: its weight along that axis is 0, and the weights along the others are shared between the sides.
+fn corners(plane: u32, rows: vec2<u32>, columns: vec2<u32>, dy: u32, dx: u32) -> vec4<f32> {
+    var c = vec4<f32>(value(plane + rows.y + columns.y));
     if dx > 0u {
-        c.y = value(at + row - dx);
+        c.y = value(plane + rows.y + columns.x);
     }
     c = c.xyxy;
-    if row > 0u {
-        c.z = value(at - row + dx);
+    if dy > 0u {
+        c.z = value(plane + rows.x + columns.y);
         c.w = c.z;
         if dx > 0u {
-            c.w = value(at - row - dx);
+            c.w = value(plane + rows.x + columns.x);
         }
     }
     return c;
 }
 
+// Positions a step before and after the centre.
+fn sides(centre: u32, step: u32, size: u32) -> vec2<u32> {
+    return vec2<u32>(max(centre, step) - step, min(centre + step, size - 1u));
+}
+
 fn weight(component: u32, dz: u32, dy: u32, dx: u32) -> f32 {
-    return bitcast<f32>(weights[((component * 3u + dz) * 3u + dy) * 3u + dx]);
+    return bitcast<f32>(weights[p.table + ((component * 3u + dz) * 3u + dy) * 3u + dx]);
 }
 
 // Root of the sum of squares; scaled by a power of two, so that no square leaves f32.
@@ -100,15 +109,17 @@ fn slopes(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
     let x = thread % p.out_x;
     let y = (thread / p.out_x) % p.out_y;
     let z = thread / (p.out_x * p.out_y);
-    let centre = p.in_at + z * p.in_z + y * p.in_y + x;
     var g = vec3<f32>();
     for (var dz = 0u; dz <= p.half; dz += 1u) {
+        let planes = sides(p.at_z + z, dz, p.size_z) * p.in_z;
         for (var dy = 0u; dy <= p.half; dy += 1u) {
+            let rows = sides(p.at_y + y, dy, p.size_y) * p.in_y;
             for (var dx = 0u; dx <= p.half; dx += 1u) {
-                let u = corners(centre + dz * p.in_z, dy * p.in_y, dx);
+                let columns = sides(p.at_x + x, dx, p.size_x);
+                let u = corners(planes.y, rows, columns, dy, dx);
                 var d = u;
                 if dz > 0u {
-                    d = corners(centre - dz * p.in_z, dy * p.in_y, dx);
+                    d = corners(planes.x, rows, columns, dy, dx);
                 }
                 let odd_z = ((u.x - d.x) + (u.y - d.y)) + ((u.z - d.z) + (u.w - d.w));
                 let odd_y = ((u.x - u.z) + (u.y - u.w)) + ((d.x - d.z) + (d.y - d.w));

@@ -21,10 +21,14 @@ struct Pass {
     along: u32,     // 1: neighbouring threads take neighbouring blocks of a line (x), 0: neighbouring lines
     packing: u32,   // log2 of voxels per word
     flip: u32,      // XOR that turns stored bits into codes
-    square: u32,    // 1: the first pass sums squares of codes
+    square: u32,    // 1: the first pass sums squares of codes; cells of moments hold M2
     threads: u32,
     phase: u32,     // outputs of block 0 that lie before output 0 (floats)
     zero: u32,      // 0, which no compiler knows
+    cell: u32,      // words of a cell of moments
+    spare_0: u32,
+    spare_1: u32,
+    spare_2: u32,
 }
 
 @group(0) @binding(0) var<uniform> p: Pass;

@@ -44,7 +44,7 @@ impl GpuFacts {
     }
 }
 
-/// Whether windows of this type have a GPU kernel, or why not.
+/// Whether windows of this type have a GPU kernel, or why not. Of f32 they also ask for [`GpuFacts::exact_floats`].
 pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result<(), &'static str> {
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Exact, _))) {
         return Err(EXACT);
@@ -61,7 +61,7 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
         }
         DType::U8 | DType::I8 | DType::U16 | DType::I16 => Ok(()),
         DType::U32 | DType::I32 => Err("no GPU kernel that sums 32-bit integers exactly: runs on the CPU"),
-        DType::F32 => Err("no GPU kernel that holds SPEC 5.6 for f32: runs on the CPU"),
+        DType::F32 => Ok(()),
         DType::F64 => Err("no GPU kernel that holds SPEC 5.6 for f64: runs on the CPU"),
     }
 }
@@ -70,9 +70,8 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
 pub const INEXACT: &str = "the adapter rounds or fuses f32 operations unlike the CPU: runs on the CPU";
 
 /// Whether a Gaussian of this type has a GPU kernel, or why not. It also asks for [`GpuFacts::exact_floats`].
-pub fn gaussian(dtype: DType, missing: bool, variance: bool) -> Result<(), &'static str> {
+pub fn gaussian(dtype: DType, missing: bool) -> Result<(), &'static str> {
     match dtype {
-        _ if variance => Err("no GPU kernel for a Gaussian variance, which takes f64: runs on the CPU"),
         DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
             Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
         }
@@ -103,6 +102,14 @@ pub mod tolerance {
     /// Components and magnitudes of gradients, times the range of the window's values over the (least) spacing. The sums of
     /// up to 27 products in f32: 27 * 2^-24 at worst, of weights that together are less than the inverse of the spacing.
     pub const GRADIENT: f64 = 2e-6;
+
+    /// Means of windows of f32, times the range of the window's values: merges of pairs round a step toward another mean to
+    /// f32, at most half of the distance. The second moment E\[v^2\] has this times its largest magnitude.
+    pub const MEAN: f64 = 1e-6;
+    /// Variances of windows of f32 and of Gaussians, relative (SPEC 5.2).
+    pub const VARIANCE: f64 = 1e-5;
+    /// Openness (SPEC 5.6).
+    pub const OPENNESS: f64 = 1e-5;
 }
 
 /// Whether obscurance of this type has a GPU kernel, or why not. `plain`: openness alone, with weights that depend on the

@@ -1,10 +1,11 @@
 //! Gradients on the device: weighted sums there, scaled and rounded here; windows that it marked, by the CPU kernel.
 
+use super::chain::{ChainJob, Extents};
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::facts;
 use super::passes::Part;
 use super::slopes::{Fit, MARKED, SlopesJob};
-use super::windows::pack;
+use super::windows::{cast, pack};
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType};
 use crate::kernel::Context;
@@ -51,10 +52,8 @@ impl Gpu {
                 let recording = job.record(part);
                 let mut fill = |to: &mut wgpu::WriteOnly<[u8]>| pack(src, part, job.pitch(part) * job.voxel, to);
                 let mut done = |bytes: Option<&[u8]>| {
-                    let sums = bytemuck::try_cast_slice(bytes.unwrap_or_default())
-                        .map_err(|e| GpuError(format!("results are not aligned: {e}")))?;
-                    let finish = Finish { job: &job, part, sums, src, fit, affine, level };
-                    finish.rows(&mut out, cx.scratch);
+                    let rows = Rows { job: &job, part, sums: cast(bytes.unwrap_or_default())? };
+                    Finish { rows, src, fit, affine, level }.write(&mut out, cx.scratch);
                     Ok(())
                 };
                 run_part(device, &recording, &mut fill, &mut done, &mut times)?;
@@ -64,30 +63,81 @@ impl Gpu {
     }
 }
 
+impl Gpu {
+    /// The gradient of a Gaussian mean of unscaled integers, whose means stay on the device: the same as
+    /// [`Gpu::gaussian`] and then [`Gpu::gradient`] of its results, bit for bit. `None` where the two must be called one by
+    /// one, because means lie at the ends of f32 or the device cannot hold both; `out` may then hold anything. After a
+    /// failure the device is opened anew and the call tried once more.
+    ///
+    /// # Errors
+    /// A second failure of the device.
+    pub fn smoothed_gradient(
+        &self,
+        src: AnyView,
+        extents: &Extents,
+        sigma: [f64; 3],
+        fit: &Fit,
+        mut out: GradientOut,
+    ) -> Result<Option<Times>, GpuError> {
+        facts::gaussian(src.dtype(), false).map_err(|e| GpuError(e.into()))?;
+        assert_eq!(src.shape(), extents.src, "the source is as large as said");
+        let job = ChainJob::new(src.dtype(), extents, sigma, fit, out.vector.is_some());
+        let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap())?))) else { return Ok(None) };
+        self.attempt(|device| {
+            let (mut times, mut marked) = (Times::default(), false);
+            for part in &parts {
+                let recording = job.record(part);
+                let pitch = job.taps.pitch(&part.taps) * job.taps.voxel;
+                let mut fill = |to: &mut wgpu::WriteOnly<[u8]>| pack(src, &part.taps, pitch, to);
+                let mut done = |bytes: Option<&[u8]>| {
+                    let sums: &[u32] = cast(bytes.unwrap_or_default())?;
+                    marked |= sums.contains(&MARKED);
+                    Rows { job: &job.slopes, part: &part.slopes, sums }.write(1.0, &mut out);
+                    Ok(())
+                };
+                run_part(device, &recording, &mut fill, &mut done, &mut times)?;
+                if marked {
+                    return Ok(None);
+                }
+            }
+            Ok(Some(times))
+        })
+    }
+}
+
 /// From a part's sums to results.
 struct Finish<'a> {
-    job: &'a SlopesJob,
-    part: &'a Part,
-    /// Bits of f32: magnitudes, or one plane per component.
-    sums: &'a [u32],
+    rows: Rows<'a>,
     src: AnyView<'a>,
     fit: &'a Fit,
     affine: Affine,
     level: Level,
 }
 
-impl Finish<'_> {
-    fn rows(&self, out: &mut GradientOut, scratch: &mut Scratch) {
+/// What the device made of a part.
+struct Rows<'a> {
+    job: &'a SlopesJob,
+    part: &'a Part,
+    /// Bits of f32: magnitudes, or one plane per component.
+    sums: &'a [u32],
+}
+
+impl Rows<'_> {
+    /// Row `[z, y]` of component `c`, or of the magnitudes.
+    fn row(&self, c: usize, [z, y]: [usize; 2]) -> &[u32] {
+        let [nz, ny, nx] = self.part.dst;
+        &self.sums[((c * nz + z) * ny + y) * nx..][..nx]
+    }
+
+    /// Scales and stores; what is marked is rubbish.
+    fn write(&self, slope: f64, out: &mut GradientOut) {
         let ([nz, ny, nx], lo) = (self.part.dst, self.part.lo);
-        let whole = nz * ny * nx;
-        let slope = self.affine.slope;
         for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-            let from = (z * ny + y) * nx;
-            let row = |c: usize| &self.sums[c * whole + from..][..nx];
             let to = [lo[0] + z, lo[1] + y, lo[2]];
             if self.job.vector {
+                let rows = [0, 1, 2].map(|c| self.row(c, [z, y]));
                 // + 0.0 makes a zero positive whatever the slope, as the CPU does
-                let part = |c: usize, i: usize| f32::from_bits(row(c)[i]) as f64 * (self.job.scale[c] * slope) + 0.0;
+                let part = |c: usize, i: usize| f32::from_bits(rows[c][i]) as f64 * (self.job.scale[c] * slope) + 0.0;
                 for (c, dst) in out.vector.iter_mut().flatten().enumerate() {
                     put(dst, to, nx, |i| part(c, i));
                 }
@@ -95,13 +145,23 @@ impl Finish<'_> {
                     put(dst, to, nx, |i| (0..3).map(|c| part(c, i)).map(|g| g * g).sum::<f64>().sqrt());
                 }
             } else if let Some(dst) = &mut out.magnitude {
-                let scale = self.job.scale[0] * slope.abs();
-                put(dst, to, nx, |i| f32::from_bits(row(0)[i]) as f64 * scale);
+                let (row, scale) = (self.row(0, [z, y]), self.job.scale[0] * slope.abs());
+                put(dst, to, nx, |i| f32::from_bits(row[i]) as f64 * scale);
             }
+        }
+    }
+}
+
+impl Finish<'_> {
+    fn write(&self, out: &mut GradientOut, scratch: &mut Scratch) {
+        self.rows.write(self.affine.slope, out);
+        let ([nz, ny, _], lo) = (self.rows.part.dst, self.rows.part.lo);
+        for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
+            let (row, to) = (self.rows.row(0, [z, y]), [lo[0] + z, lo[1] + y, lo[2]]);
             // Marks stand in all components.
             let mut x = 0;
-            while let Some(first) = row(0)[x..].iter().position(|&v| v == MARKED).map(|d| x + d) {
-                let len = row(0)[first..].iter().take_while(|&&v| v == MARKED).count();
+            while let Some(first) = row[x..].iter().position(|&v| v == MARKED).map(|d| x + d) {
+                let len = row[first..].iter().take_while(|&&v| v == MARKED).count();
                 self.redo(out, [to[0], to[1], to[2] + first], len, scratch);
                 x = first + len;
             }
@@ -110,7 +170,7 @@ impl Finish<'_> {
 
     /// A run of voxels by the CPU kernel, which gives the same wherever a call starts.
     fn redo(&self, out: &mut GradientOut, to: [usize; 3], len: usize, scratch: &mut Scratch) {
-        let (shape, at) = ([1, 1, len], std::array::from_fn(|a| self.job.at[a] + to[a]));
+        let (shape, at) = ([1, 1, len], std::array::from_fn(|a| self.rows.job.at[a] + to[a]));
         let mut made: [Voxels; 4] = std::array::from_fn(|_| Voxels::zeroed(DType::F32, len));
         let [m, z, y, x] = &mut made;
         let run = GradientOut {

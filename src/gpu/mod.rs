@@ -8,19 +8,25 @@
 //! | `record` | the device's work as data: buffers, dispatches, what comes back |
 //! | `shaders` | their texts, put together of what they share |
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
+//! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
+//! | `chain` | a Gaussian and the gradient of it recorded together |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
-//! | `windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
+//! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
 //!
 //! Everything above `device` knows no wgpu.
 
+pub mod chain;
 pub mod device;
 pub mod engine;
 pub mod facts;
+mod float_windows;
 mod gaussian;
 mod gradient;
 mod obscurance;
+pub mod pairs;
 pub mod passes;
+mod probe;
 pub mod record;
 pub mod shaders;
 pub mod slopes;

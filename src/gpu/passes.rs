@@ -29,6 +29,8 @@ pub struct Pass {
     pub threads: u32,
     pub phase: u32,
     pub zero: u32,
+    pub cell: u32,
+    pub spare: [u32; 3],
 }
 
 /// A quantity that the device makes for every window.
@@ -40,14 +42,21 @@ pub enum Quantity {
         square: bool,
         wide: bool,
     },
+    /// Least and greatest f32, as codes in their order.
+    Order,
+    /// Voxels and mean of f32; with `square` M2, too.
+    Moments {
+        square: bool,
+    },
 }
 
 impl Quantity {
     /// Bytes per window.
     pub fn bytes(self) -> u64 {
         match self {
-            Quantity::Sum { wide: true, .. } => 8,
-            _ => 4,
+            Quantity::Sum { wide: true, .. } | Quantity::Order => 8,
+            Quantity::Moments { square } => 4 * cell(square) as u64,
+            Quantity::Sum { wide: false, .. } | Quantity::Extremes => 4,
         }
     }
 }
@@ -60,11 +69,20 @@ pub struct Job {
     pub at: [usize; 3],
     /// At most the extent of `src` less one: a larger radius changes no window.
     pub radius: [usize; 3],
-    /// Bytes of a voxel: 1 or 2.
+    /// First output voxel in the volume. Floats are merged in blocks that start at multiples of the window there.
+    pub place: [i64; 3],
+    /// Bytes of a voxel: 1, 2 or 4.
     pub voxel: usize,
     /// Stored as two's complement.
     pub signed: bool,
+    /// f32.
+    pub real: bool,
     pub needs: Needs,
+}
+
+/// Words of a cell of moments.
+pub fn cell(square: bool) -> usize {
+    if square { 5 } else { 3 }
 }
 
 /// A box of the outputs and the voxels that its windows see.
@@ -81,10 +99,15 @@ pub struct Part {
 impl Job {
     /// `None` if voxels of this type have no kernel here, or the windows could hold 2^31 voxels.
     pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], radius: [usize; 3], needs: Needs) -> Option<Job> {
-        let (voxel, signed) = packed(dtype)?;
+        let Stored { voxel, signed, real } = stored(dtype)?;
         let radius = std::array::from_fn(|a| radius[a].min(src[a].saturating_sub(1)));
-        let job = Job { src, dst, at, radius, voxel, signed, needs };
+        let job = Job { src, dst, at, radius, place: [0; 3], voxel, signed, real, needs };
         (job.count() < 1 << 31).then_some(job)
+    }
+
+    /// With the first output voxel's place in the volume.
+    pub fn placed(self, place: [i64; 3]) -> Job {
+        Job { place, ..self }
     }
 
     /// Most voxels of a window.
@@ -94,6 +117,11 @@ impl Job {
 
     /// What the device makes, with the widths that hold it: a sum of n codes up to T fits 32 bits where n T < 2^32.
     pub fn quantities(&self) -> Vec<Quantity> {
+        if self.real {
+            // Extremes tell which windows are the CPU's, and which are constant.
+            let moments = Quantity::Moments { square: self.needs.variance };
+            return [Some(Quantity::Order), self.needs.mean.then_some(moments)].into_iter().flatten().collect();
+        }
         let top = (1u128 << (8 * self.voxel)) - 1;
         let wide = |most: u128| self.count() as u128 * most >= 1 << 32;
         let mut list = Vec::new();
@@ -154,9 +182,17 @@ impl Job {
         let axis = |a: usize| {
             let window = 2 * self.radius[a] as u32 + 1;
             let (n, m) = (part.src[a] as u32, part.dst[a] as u32);
-            let block = if quantity == Quantity::Extremes { window } else { window.max(32) };
+            let block = if matches!(quantity, Quantity::Sum { .. }) { window.max(32) } else { window };
             let start = (self.at[a] + part.lo[a]) as i64 - self.radius[a] as i64 - part.from[a] as i64;
-            Pass { n, m, first: start as i32, window, blocks: m.div_ceil(block), block, ..Pass::default() }
+            let phase = match quantity {
+                Quantity::Moments { .. } => {
+                    let first = self.place[a] + part.lo[a] as i64 - self.radius[a] as i64;
+                    first.rem_euclid(window as i64) as u32
+                }
+                _ => 0,
+            };
+            let blocks = (m + phase).div_ceil(block);
+            Pass { n, m, first: start as i32, window, blocks, block, phase, ..Pass::default() }
         };
         let z = Pass {
             in_axis: ny * pitch,
@@ -166,9 +202,8 @@ impl Job {
             out_i: 1,
             out_j: nx,
             lines: nx,
-            packing: if self.voxel == 1 { 2 } else { 1 },
+            packing: [2, 1, 0, 0][self.voxel - 1],
             flip: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
-            square: matches!(quantity, Quantity::Sum { square: true, .. }) as u32,
             ..axis(0)
         };
         let y =
@@ -185,8 +220,16 @@ impl Job {
             ..axis(2)
         };
         debug_assert!(nz > 0 && mz > 0);
-        let threads = |p: Pass, lines: u32| Pass { threads: p.blocks * p.lines * lines, ..p };
-        [threads(z, ny), threads(y, mz), threads(x, mz)]
+        let (square, words) = match quantity {
+            Quantity::Moments { square } => (square, cell(square)),
+            Quantity::Sum { square, .. } => (square, 0),
+            _ => (false, 0),
+        };
+        let shared = |p: Pass, lines: u32| {
+            let threads = p.blocks * p.lines * lines;
+            Pass { threads, square: square as u32, cell: words as u32, ..p }
+        };
+        [shared(z, ny), shared(y, mz), shared(x, mz)]
     }
 
     /// Every quantity of a part: three passes, then what comes back, one quantity after the other.
@@ -198,6 +241,8 @@ impl Job {
                 Quantity::Extremes => Shader::Extremes,
                 Quantity::Sum { wide: false, .. } => Shader::Sums32,
                 Quantity::Sum { wide: true, .. } => Shader::Sums64,
+                Quantity::Order => Shader::Order,
+                Quantity::Moments { .. } => Shader::Moments,
             };
             for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
                 use Buffer::{A, B, Source};
@@ -321,8 +366,22 @@ mod tests {
         let needs = Needs { extremes: false, mean: true, variance: true, float: false };
         let far = Job::new(DType::U16, [60; 3], [60; 3], [0; 3], [60; 3], needs).unwrap();
         assert_eq!(far.quantities().iter().map(|q| q.bytes()).collect::<Vec<_>>(), [8, 8]);
-        assert!(Job::new(DType::F32, [60; 3], [60; 3], [0; 3], [60; 3], needs).is_none());
+        assert!(Job::new(DType::F64, [60; 3], [60; 3], [0; 3], [60; 3], needs).is_none());
         assert!(Job::new(DType::U8, [1300; 3], [9; 3], [0; 3], [2000; 3], needs).is_none());
+    }
+
+    #[test]
+    fn floats_are_merged_in_blocks_of_the_volume() {
+        let job = job(DType::F32, 4).placed([-3, 17, 100]);
+        for part in job.parts(40_000).unwrap() {
+            let recording = job.record(&part);
+            assert_eq!(recording.fault(), None);
+            for (a, pass) in job.passes(&part, Quantity::Moments { square: true }).iter().enumerate() {
+                let first = job.place[a] + part.lo[a] as i64 - 4 - pass.phase as i64;
+                assert!(pass.phase < 9 && first.rem_euclid(9) == 0);
+                assert!(pass.blocks * 9 >= pass.m + pass.phase && (pass.blocks - 1) * 9 < pass.m + pass.phase);
+            }
+        }
     }
 
     #[test]

@@ -25,20 +25,35 @@ pub enum Shader {
     Obscurance,
     Gaussian,
     Gradient,
+    Order,
+    Moments,
+    GaussianVariance,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 6] =
-        [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance, Shader::Gaussian, Shader::Gradient];
+    pub const ALL: [Shader; 9] = [
+        Shader::Extremes,
+        Shader::Sums32,
+        Shader::Sums64,
+        Shader::Obscurance,
+        Shader::Gaussian,
+        Shader::Gradient,
+        Shader::Order,
+        Shader::Moments,
+        Shader::GaussianVariance,
+    ];
 
     fn composed(self) -> Composed {
         match self {
-            Shader::Extremes => composed!("common", "window_pass", "window_extremes"),
+            Shader::Extremes => composed!("common", "window_pass", "window_herk", "window_kept", "window_extremes"),
             Shader::Sums32 => composed!("common", "window_pass", "window_sums", "window_sums32"),
             Shader::Sums64 => composed!("common", "window_pass", "window_sums", "window_sums64"),
             Shader::Obscurance => composed!("common", "obscurance"),
-            Shader::Gaussian => composed!("common", "floats", "gaussian"),
+            Shader::Gaussian => composed!("common", "floats", "gaussian_taps", "gaussian"),
             Shader::Gradient => composed!("common", "gradient"),
+            Shader::Order => composed!("common", "window_pass", "window_herk", "window_kept", "window_order"),
+            Shader::Moments => composed!("common", "floats", "pairs", "window_pass", "window_herk", "window_moments"),
+            Shader::GaussianVariance => composed!("common", "floats", "pairs", "gaussian_taps", "gaussian_variance"),
         }
     }
 
@@ -68,7 +83,7 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Obscurance => 4,
-            Shader::Gaussian | Shader::Gradient => 3,
+            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient => 3,
             _ => 2,
         }
     }

@@ -14,7 +14,8 @@ pub struct Slopes {
     pub out: [u32; 3],
     pub plane: u32,
     pub row: u32,
-    pub at: u32,
+    pub at: [u32; 3],
+    pub size: [u32; 3],
     pub half: u32,
     pub packing: u32,
     pub sign: u32,
@@ -23,11 +24,26 @@ pub struct Slopes {
     pub missing: u32,
     pub vector: u32,
     pub threads: u32,
-    pub spare: [u32; 2],
+    pub table: u32,
 }
 
 /// Bits of a result that the device leaves to the CPU: a NaN that arithmetic does not make.
 pub const MARKED: u32 = u32::MAX;
+
+/// Words of the table of weights.
+pub const WEIGHTS: u64 = 81;
+
+/// Where a dispatch reads: a dense box whose rows are `pitch` voxels apart.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Input {
+    pub buffer: Buffer,
+    pub size: Shape,
+    pub pitch: usize,
+    /// Centre of output 0.
+    pub centre: [usize; 3],
+    /// Where the weights start in the tables.
+    pub table: u32,
+}
 
 /// Beyond this ratio of the components' weights, magnitudes are not made from what f32 keeps of the smallest.
 const MOST_UNEQUAL: f64 = (1u64 << 30) as f64;
@@ -94,19 +110,19 @@ impl SlopesJob {
         part.src[2].next_multiple_of(4 / self.voxel)
     }
 
-    fn result_bytes(&self, part: &Part) -> u64 {
-        part.dst.iter().map(|&n| n as u64).product::<u64>() * if self.vector { 12 } else { 4 }
+    pub(super) fn result_bytes(&self, dst: Shape) -> u64 {
+        dst.iter().map(|&n| n as u64).product::<u64>() * if self.vector { 12 } else { 4 }
     }
 
     fn sizes(&self, part: &Part) -> Sizes {
         let [nz, ny, _] = part.src;
         Sizes {
             params: PARAMS_STRIDE,
-            tables: rounded(81 * 4),
+            tables: rounded(4 * WEIGHTS),
             source: rounded((nz * ny * self.pitch(part) * self.voxel) as u64),
-            a: rounded(self.result_bytes(part)),
+            a: rounded(self.result_bytes(part.dst)),
             b: 0,
-            read: rounded(self.result_bytes(part)),
+            read: rounded(self.result_bytes(part.dst)),
         }
     }
 
@@ -123,15 +139,22 @@ impl SlopesJob {
     }
 
     pub fn record(&self, part: &Part) -> Recording {
-        let pitch = self.pitch(part);
-        let strides = [part.src[1] * pitch, pitch, 1];
-        let centre: [usize; 3] = std::array::from_fn(|a| self.at[a] + part.lo[a] - part.from[a]);
-        let threads = part.dst.iter().product::<usize>() as u32;
+        let centre = std::array::from_fn(|a| self.at[a] + part.lo[a] - part.from[a]);
+        let from = Input { buffer: Buffer::Source, size: part.src, pitch: self.pitch(part), centre, table: 0 };
+        let dispatch = self.dispatch(&from, part.dst, Buffer::A);
+        let back = Readback { from: Buffer::A, bytes: self.result_bytes(part.dst), to: 0 };
+        let commands = vec![Command::Dispatch(dispatch), Command::Readback(back)];
+        Recording { sizes: self.sizes(part), tables: self.table(), commands }
+    }
+
+    pub(super) fn dispatch(&self, from: &Input, dst: Shape, to: Buffer) -> Dispatch {
+        let threads = dst.iter().product::<usize>() as u32;
         let slopes = Slopes {
-            out: part.dst.map(|n| n as u32),
-            plane: strides[0] as u32,
-            row: strides[1] as u32,
-            at: centre.iter().zip(strides).map(|(c, s)| c * s).sum::<usize>() as u32,
+            out: dst.map(|n| n as u32),
+            plane: (from.size[1] * from.pitch) as u32,
+            row: from.pitch as u32,
+            at: from.centre.map(|n| n as u32),
+            size: from.size.map(|n| n as u32),
             half: self.half as u32,
             packing: [2, 1, 0, 0][self.voxel - 1],
             sign: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
@@ -140,22 +163,19 @@ impl SlopesJob {
             missing: self.missing.unwrap_or(0),
             vector: self.vector as u32,
             threads,
-            ..Slopes::default()
+            table: from.table,
         };
-        let dispatch = Dispatch {
+        Dispatch {
             shader: Shader::Gradient,
             entry: 0,
             params: bytemuck::bytes_of(&slopes).to_vec(),
-            bind: vec![Buffer::Source, Buffer::A, Buffer::Tables],
+            bind: vec![from.buffer, to, Buffer::Tables],
             threads,
-        };
-        let back = Readback { from: Buffer::A, bytes: self.result_bytes(part), to: 0 };
-        let commands = vec![Command::Dispatch(dispatch), Command::Readback(back)];
-        Recording { sizes: self.sizes(part), tables: self.table(), commands }
+        }
     }
 
     /// Weights as the shader adds them up: mirrored voxels are added for every axis, also where both sides are one voxel.
-    fn table(&self) -> Vec<u32> {
+    pub(super) fn table(&self) -> Vec<u32> {
         let mut words = Vec::with_capacity(81);
         for (a, along) in self.along.iter().enumerate() {
             for (z, y, x) in (0..3).flat_map(|z| (0..3).flat_map(move |y| (0..3).map(move |x| (z, y, x)))) {

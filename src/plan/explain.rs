@@ -42,6 +42,9 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
         let (_, device, reason) = &plan.placement[s];
         let _ = writeln!(w, "step {s}: {} -> {} on {device} ({reason})", reads(plan, step), makes(plan, step));
         let _ = writeln!(w, "  {}, reach {:?}, halo beyond the brick {:?}", step.kind.name(), step.reach, step.halo);
+        if let Some(reader) = plan.chains[s] {
+            let _ = writeln!(w, "  its results stay on the GPU for step {reader}");
+        }
         if plan.shares(s) {
             let _ = writeln!(w, "  CPU workers take bricks too while the GPU's slots are taken");
         }

@@ -2,6 +2,7 @@
 //! indices, printable, without threads, buffers or files.
 
 pub mod brick;
+pub mod chains;
 pub mod explain;
 pub mod graph;
 pub mod lengths;
@@ -64,6 +65,8 @@ pub struct Plan {
     pub placement: Placement,
     /// The adapter that the steps placed on "gpu" run on.
     pub gpu: Option<GpuFacts>,
+    /// By step: the step for which its results stay on the GPU.
+    pub chains: Vec<Option<StepId>>,
 }
 
 impl Plan {
@@ -91,11 +94,13 @@ impl Plan {
             warnings,
             placement,
             gpu,
+            chains: Vec::new(),
         };
         if plan.waives_byte_identity() {
             plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
         }
         plan.groups = tasks::groups(&plan);
+        plan.chains = chains::chains(&plan);
         for g in 0..plan.groups.len() {
             plan.groups[g].brick = brick::choose(&plan, &plan.groups[g], config)?;
         }
@@ -136,13 +141,13 @@ impl Plan {
     /// Whether a step on the GPU gives bricks to CPU workers while all slots are taken: where results are integers or fixed
     /// point, and with `lanes = "mixed"` everywhere.
     pub fn shares(&self, step: StepId) -> bool {
-        self.on_gpu(step) && (self.lanes == Lanes::Mixed || !floats(&self.graph.steps[step]))
+        self.on_gpu(step) && (self.lanes == Lanes::Mixed || !floats(&self.graph, &self.graph.steps[step]))
     }
 
     /// `lanes = "mixed"` with a step whose floats both lanes make.
     pub fn waives_byte_identity(&self) -> bool {
         let steps = &self.graph.steps;
-        self.lanes == Lanes::Mixed && (0..steps.len()).any(|s| self.on_gpu(s) && floats(&steps[s]))
+        self.lanes == Lanes::Mixed && (0..steps.len()).any(|s| self.on_gpu(s) && floats(&self.graph, &steps[s]))
     }
 
     /// Tasks of all groups; their numbers are dense.
@@ -184,21 +189,23 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     let missing = input.missing.is_some();
     match (windows, &step.kind) {
         (Some(channels), _) => facts::window(input.dtype, missing, channels),
-        (None, graph::StepKind::Gaussian { channels, .. }) => {
-            facts::gaussian(input.dtype, missing, channels.contains(&graph::Moment::Variance))
-        }
+        (None, graph::StepKind::Gaussian { .. }) => facts::gaussian(input.dtype, missing),
         (None, _) => unreachable!("other kinds of steps have returned"),
     }
 }
 
 /// Whether a step on the GPU makes floats there.
-fn floats(step: &graph::Step) -> bool {
-    matches!(step.kind, graph::StepKind::Gaussian { .. } | graph::StepKind::Gradient { .. })
+fn floats(graph: &Graph, step: &graph::Step) -> bool {
+    exact(graph, step) || matches!(step.kind, graph::StepKind::Gradient { .. })
 }
 
 /// Whether a step needs [`GpuFacts::exact_floats`].
-fn exact(step: &graph::Step) -> bool {
-    matches!(step.kind, graph::StepKind::Gaussian { .. })
+fn exact(graph: &Graph, step: &graph::Step) -> bool {
+    match step.kind {
+        graph::StepKind::Gaussian { .. } => true,
+        graph::StepKind::Window { .. } => graph.wires[step.inputs[0]].dtype.is_float(),
+        _ => false,
+    }
 }
 
 /// Device of every step. An adapter is looked for where one is demanded, or where `auto` has a step for it.
@@ -213,7 +220,7 @@ fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement
     let place = |s: &graph::Step| match (&found, supported(s)) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
-        (Some(Ok(gpu)), Ok(())) if exact(s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if exact(graph, s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
         (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),

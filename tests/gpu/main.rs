@@ -3,8 +3,10 @@
 //!
 //! Without a Vulkan adapter these tests pass and are listed when all have run, unless OCCLUDE_REQUIRE_GPU_TESTS=1.
 
+mod chains;
 #[path = "../common/mod.rs"]
 mod common;
+mod float_windows;
 mod gaussian;
 mod gradient;
 mod obscurance;

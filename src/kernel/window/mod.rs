@@ -16,6 +16,7 @@ mod estimate;
 mod exact;
 mod extremes;
 pub mod finish;
+pub mod finish_floats;
 mod float;
 mod float_estimate;
 mod int;
