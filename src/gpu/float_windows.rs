@@ -4,6 +4,7 @@
 use super::engine::GpuError;
 use super::pairs::Cell;
 use super::passes::{self, Job, Part, Quantity, result_bytes};
+use super::slopes::MARKED;
 use super::windows::cast;
 use crate::brick::Voxels;
 use crate::grid::{AnyView, AnyViewMut, Region, View, Voxel};
@@ -16,10 +17,45 @@ use crate::stage::WindowParams;
 const LARGE: f32 = (1u64 << 40) as f32;
 const SMALL: f32 = 1.0 / (1u64 << 30) as f32;
 
-/// The results of a part.
-pub(super) struct FloatPart<'a> {
-    job: &'a Job,
-    part: &'a Part,
+/// Writes a part's voxels from what came back of it.
+pub(super) fn finish(
+    job: &Job,
+    part: &Part,
+    bytes: &[u8],
+    src: View<f32>,
+    params: &WindowParams,
+    outs: &mut [WindowOut],
+    cx: &mut Context,
+) -> Result<(), GpuError> {
+    if job.finish.is_some() {
+        let results: &[u32] = cast(bytes)?;
+        store_all(results, part, outs);
+        redo(job, part, |i| results[i] == MARKED, src, params, outs, cx);
+        return Ok(());
+    }
+    let moments = FloatPart::new(job, part, bytes)?;
+    finish_floats(src, params, job.at, outs, part.lo, part.dst, |i| moments.window(i), cx);
+    redo(job, part, |i| moments.left(i), src, params, outs, cx);
+    Ok(())
+}
+
+/// Copies results, one plane per channel, to their rows.
+pub(super) fn store_all(results: &[u32], part: &Part, outs: &mut [WindowOut]) {
+    let n: usize = part.dst.iter().product();
+    outs.iter_mut().enumerate().for_each(|(c, out)| store(&results[c * n..][..n], part, &mut out.dst));
+}
+
+fn store(results: &[u32], part: &Part, dst: &mut AnyViewMut) {
+    let AnyViewMut::F32(dst) = dst else { unreachable!("the device makes f32") };
+    let ([nz, ny, nx], [z0, y0, x0]) = (part.dst, part.lo);
+    for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
+        let row: &[f32] = bytemuck::cast_slice(&results[(z * ny + y) * nx..][..nx]);
+        dst.row_at(z0 + z, y0 + y)[x0..x0 + nx].copy_from_slice(row);
+    }
+}
+
+/// The moments of a part.
+struct FloatPart<'a> {
     /// Pairs of codes.
     order: &'a [[u32; 2]],
     /// Cells, or nothing where no channel needs them.
@@ -28,8 +64,8 @@ pub(super) struct FloatPart<'a> {
 }
 
 impl<'a> FloatPart<'a> {
-    pub fn new(job: &'a Job, part: &'a Part, bytes: &'a [u8]) -> Result<FloatPart<'a>, GpuError> {
-        let mut out = FloatPart { job, part, order: &[], cells: &[], words: 0 };
+    fn new(job: &Job, part: &Part, bytes: &'a [u8]) -> Result<FloatPart<'a>, GpuError> {
+        let mut out = FloatPart { order: &[], cells: &[], words: 0 };
         let mut from = 0;
         for quantity in job.quantities() {
             let len = result_bytes(part, quantity) as usize;
@@ -65,53 +101,45 @@ impl<'a> FloatPart<'a> {
         let most = lo.abs().max(hi.abs());
         most >= LARGE || most < SMALL && most > 0.0
     }
+}
 
-    /// Writes the part's voxels.
-    pub fn finish(
-        &self,
-        src: View<f32>,
-        params: &WindowParams,
-        outs: &mut [WindowOut],
-        cx: &mut Context,
-    ) -> Result<(), GpuError> {
-        finish_floats(src, params, self.job.at, outs, self.part.lo, self.part.dst, |i| self.window(i), cx);
-        if let Some(bounds) = self.left_box() {
-            self.redo(src, params, outs, &bounds, cx);
-        }
-        Ok(())
-    }
+/// The least box of a part that holds every window that is left to the CPU.
+fn left_box(part: &Part, left: impl Fn(usize) -> bool) -> Option<Region> {
+    let all = Region::whole(part.dst).iter().enumerate().filter(|(i, _)| left(*i)).map(|(_, v)| v);
+    all.fold(None, |held: Option<Region>, v| {
+        let one = Region::new(v, v.map(|c| c + 1));
+        let least = |h: Region| std::array::from_fn(|a| h.lo[a].min(one.lo[a]));
+        let most = |h: Region| std::array::from_fn(|a| h.hi[a].max(one.hi[a]));
+        Some(held.map_or(one, |h| Region::new(least(h), most(h))))
+    })
+}
 
-    /// The least box of the part that holds every window that is left to the CPU.
-    fn left_box(&self) -> Option<Region> {
-        let left = Region::whole(self.part.dst).iter().enumerate().filter(|(i, _)| self.left(*i)).map(|(_, v)| v);
-        left.fold(None, |held: Option<Region>, v| {
-            let one = Region::new(v, v.map(|c| c + 1));
-            let least = |h: Region| std::array::from_fn(|a| h.lo[a].min(one.lo[a]));
-            let most = |h: Region| std::array::from_fn(|a| h.hi[a].max(one.hi[a]));
-            Some(held.map_or(one, |h| Region::new(least(h), most(h))))
-        })
-    }
-
-    /// Makes a box of the part on the CPU, which gives the same wherever a call starts, and keeps what is left to it.
-    fn redo(&self, src: View<f32>, params: &WindowParams, outs: &mut [WindowOut], bounds: &Region, cx: &mut Context) {
-        let first = bounds.lo.map(|v| v as usize);
-        let shape = bounds.shape();
-        let lo: [usize; 3] = std::array::from_fn(|a| self.part.lo[a] + first[a]);
-        let at = std::array::from_fn(|a| self.job.at[a] + lo[a]);
-        let voxel = std::array::from_fn(|a| self.job.place[a] + lo[a] as i64);
-        let mut made: Vec<Voxels> = outs.iter().map(|o| Voxels::zeroed(o.dst.dtype(), bounds.voxels())).collect();
-        let mut again: Vec<WindowOut> = (outs.iter().zip(&mut made))
-            .map(|(o, v)| WindowOut { channel: o.channel, dst: v.view_mut(shape) })
-            .collect();
-        window::window(AnyView::F32(src), params, Place::new(at, voxel), &mut again, cx);
-        let [_, ny, nx] = self.part.dst;
-        for (out, made) in outs.iter_mut().zip(&made) {
-            for (j, v) in bounds.iter().enumerate() {
-                let [z, y, x] = v.map(|c| c as usize);
-                if self.left((z * ny + y) * nx + x) {
-                    let to = [self.part.lo[0] + z, self.part.lo[1] + y, self.part.lo[2] + x];
-                    put(&mut out.dst, to, made.at(j));
-                }
+/// Makes the windows of a part that are left to the CPU: all of the box that holds them, since the CPU gives the same
+/// wherever a call starts, of which those are kept.
+fn redo(
+    job: &Job,
+    part: &Part,
+    left: impl Fn(usize) -> bool,
+    src: View<f32>,
+    params: &WindowParams,
+    outs: &mut [WindowOut],
+    cx: &mut Context,
+) {
+    let Some(bounds) = left_box(part, &left) else { return };
+    let shape = bounds.shape();
+    let lo: [usize; 3] = std::array::from_fn(|a| part.lo[a] + bounds.lo[a] as usize);
+    let at = std::array::from_fn(|a| job.at[a] + lo[a]);
+    let voxel = std::array::from_fn(|a| job.place[a] + lo[a] as i64);
+    let mut made: Vec<Voxels> = outs.iter().map(|o| Voxels::zeroed(o.dst.dtype(), bounds.voxels())).collect();
+    let mut again: Vec<WindowOut> =
+        (outs.iter().zip(&mut made)).map(|(o, v)| WindowOut { channel: o.channel, dst: v.view_mut(shape) }).collect();
+    window::window(AnyView::F32(src), params, Place::new(at, voxel), &mut again, cx);
+    let [_, ny, nx] = part.dst;
+    for (out, made) in outs.iter_mut().zip(&made) {
+        for (j, v) in bounds.iter().enumerate() {
+            let [z, y, x] = v.map(|c| c as usize);
+            if left((z * ny + y) * nx + x) {
+                put(&mut out.dst, [part.lo[0] + z, part.lo[1] + y, part.lo[2] + x], made.at(j));
             }
         }
     }

@@ -1,6 +1,5 @@
 //! Gradients on the device: weighted sums there, scaled and rounded here; windows that it marked, by the CPU kernel.
 
-use super::chain::{ChainJob, Extents};
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::facts;
 use super::passes::Part;
@@ -63,48 +62,6 @@ impl Gpu {
     }
 }
 
-impl Gpu {
-    /// The gradient of a Gaussian mean of unscaled integers, whose means stay on the device: the same as
-    /// [`Gpu::gaussian`] and then [`Gpu::gradient`] of its results, bit for bit. `None` where the two must be called one by
-    /// one, because means lie at the ends of f32 or the device cannot hold both; `out` may then hold anything. After a
-    /// failure the device is opened anew and the call tried once more.
-    ///
-    /// # Errors
-    /// A second failure of the device.
-    pub fn smoothed_gradient(
-        &self,
-        src: AnyView,
-        extents: &Extents,
-        sigma: [f64; 3],
-        fit: &Fit,
-        mut out: GradientOut,
-    ) -> Result<Option<Times>, GpuError> {
-        facts::gaussian(src.dtype(), false).map_err(|e| GpuError(e.into()))?;
-        assert_eq!(src.shape(), extents.src, "the source is as large as said");
-        let job = ChainJob::new(src.dtype(), extents, sigma, fit, out.vector.is_some());
-        let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap())?))) else { return Ok(None) };
-        self.attempt(|device| {
-            let (mut times, mut marked) = (Times::default(), false);
-            for part in &parts {
-                let recording = job.record(part);
-                let pitch = job.taps.pitch(&part.taps) * job.taps.voxel;
-                let mut fill = |to: &mut wgpu::WriteOnly<[u8]>| pack(src, &part.taps, pitch, to);
-                let mut done = |bytes: Option<&[u8]>| {
-                    let sums: &[u32] = cast(bytes.unwrap_or_default())?;
-                    marked |= sums.contains(&MARKED);
-                    Rows { job: &job.slopes, part: &part.slopes, sums }.write(1.0, &mut out);
-                    Ok(())
-                };
-                run_part(device, &recording, &mut fill, &mut done, &mut times)?;
-                if marked {
-                    return Ok(None);
-                }
-            }
-            Ok(Some(times))
-        })
-    }
-}
-
 /// From a part's sums to results.
 struct Finish<'a> {
     rows: Rows<'a>,
@@ -115,11 +72,11 @@ struct Finish<'a> {
 }
 
 /// What the device made of a part.
-struct Rows<'a> {
-    job: &'a SlopesJob,
-    part: &'a Part,
+pub(super) struct Rows<'a> {
+    pub job: &'a SlopesJob,
+    pub part: &'a Part,
     /// Bits of f32: magnitudes, or one plane per component.
-    sums: &'a [u32],
+    pub sums: &'a [u32],
 }
 
 impl Rows<'_> {
@@ -130,7 +87,7 @@ impl Rows<'_> {
     }
 
     /// Scales and stores; what is marked is rubbish.
-    fn write(&self, slope: f64, out: &mut GradientOut) {
+    pub fn write(&self, slope: f64, out: &mut GradientOut) {
         let ([nz, ny, nx], lo) = (self.part.dst, self.part.lo);
         for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
             let to = [lo[0] + z, lo[1] + y, lo[2]];

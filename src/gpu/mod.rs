@@ -9,7 +9,8 @@
 //! | `shaders` | their texts, put together of what they share |
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
-//! | `chain` | a Gaussian and the gradient of it recorded together |
+//! | `finish` | results of f32 windows made of moments there |
+//! | `chain`, `smoothed` | a Gaussian and what reads it, recorded together and called |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
 //! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
@@ -20,6 +21,7 @@ pub mod chain;
 pub mod device;
 pub mod engine;
 pub mod facts;
+pub mod finish;
 mod float_windows;
 mod gaussian;
 mod gradient;
@@ -31,6 +33,7 @@ pub mod record;
 pub mod shaders;
 pub mod slopes;
 mod slot;
+mod smoothed;
 pub mod sweep;
 pub mod taps;
 mod windows;

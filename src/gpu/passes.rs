@@ -1,9 +1,11 @@
 //! Windows: how a call is cut into parts that fit the device, and the three passes of each quantity. Pure arithmetic,
 //! shared by planner and engine.
 
+use super::finish::Channels;
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Shape};
 use crate::kernel::window::Needs;
+use crate::stage::{WindowChannel, WindowParams};
 
 /// What one dispatch does; the shaders' `struct Pass`, which explains the fields.
 #[repr(C)]
@@ -78,6 +80,8 @@ pub struct Job {
     /// f32.
     pub real: bool,
     pub needs: Needs,
+    /// What the device makes of moments of f32; `None`: they come back as they are.
+    pub finish: Option<Channels>,
 }
 
 /// Words of a cell of moments.
@@ -101,13 +105,18 @@ impl Job {
     pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], radius: [usize; 3], needs: Needs) -> Option<Job> {
         let Stored { voxel, signed, real } = stored(dtype)?;
         let radius = std::array::from_fn(|a| radius[a].min(src[a].saturating_sub(1)));
-        let job = Job { src, dst, at, radius, place: [0; 3], voxel, signed, real, needs };
+        let job = Job { src, dst, at, radius, place: [0; 3], voxel, signed, real, needs, finish: None };
         (job.count() < 1 << 31).then_some(job)
     }
 
     /// With the first output voxel's place in the volume.
     pub fn placed(self, place: [i64; 3]) -> Job {
         Job { place, ..self }
+    }
+
+    /// With what the device makes of windows of f32, where these channels can be made there.
+    pub fn finished(self, params: &WindowParams, channels: &[WindowChannel]) -> Job {
+        Job { finish: Channels::of(params, channels).filter(|_| self.real), ..self }
     }
 
     /// Most voxels of a window.
@@ -138,7 +147,7 @@ impl Job {
         list
     }
 
-    fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
+    pub(super) fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
         Part::around(self.src, self.at, self.radius, lo, dst)
     }
 
@@ -152,13 +161,18 @@ impl Job {
         let element = quantities.iter().map(|q| q.bytes()).max().unwrap_or(4);
         let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
         let ([nz, ny, nx], [mz, my, _]) = (part.src, part.dst);
+        let b = rounded(product([mz, my, nx]) * element);
+        let raw = quantities.iter().map(|q| rounded(product(part.dst) * q.bytes())).sum::<u64>();
+        let results = self.finish.map(|f| rounded(product(part.dst) * 4 * f.count() as u64));
         Sizes {
-            params: (3 * quantities.len() as u64 * PARAMS_STRIDE).max(PARAMS_STRIDE),
+            params: (3 * quantities.len() as u64 + 1) * PARAMS_STRIDE,
             tables: 0,
             source: rounded(product([nz, ny, self.pitch(part)]) * self.voxel as u64),
             a: rounded(product([mz, ny, nx]) * element),
-            b: rounded(product([mz, my, nx]) * element),
-            read: quantities.iter().map(|q| rounded(product(part.dst) * q.bytes())).sum::<u64>().max(256),
+            b: b.max(results.unwrap_or(0)),
+            c: results.map_or(0, |_| rounded(product(part.dst) * Quantity::Order.bytes())),
+            d: 0,
+            read: results.unwrap_or(raw).max(256),
         }
     }
 
@@ -232,8 +246,10 @@ impl Job {
         [shared(z, ny), shared(y, mz), shared(x, mz)]
     }
 
-    /// Every quantity of a part: three passes, then what comes back, one quantity after the other.
+    /// Every quantity of a part: three passes, then what comes back, one quantity after the other; or what the device makes
+    /// of all of them.
     pub fn record(&self, part: &Part) -> Recording {
+        use Buffer::{A, B, C, Source};
         let mut commands = Vec::new();
         let mut to = 0;
         for quantity in self.quantities() {
@@ -244,16 +260,23 @@ impl Job {
                 Quantity::Order => Shader::Order,
                 Quantity::Moments { .. } => Shader::Moments,
             };
+            let last = if self.finish.is_some() && quantity == Quantity::Order { C } else { A };
             for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
-                use Buffer::{A, B, Source};
-                let bind = [[Source, A], [A, B], [B, A]][axis].to_vec();
+                let bind = [[Source, A], [A, B], [B, last]][axis].to_vec();
                 let params = bytemuck::bytes_of(&pass).to_vec();
                 let entry = (axis > 0) as usize;
                 commands.push(Command::Dispatch(Dispatch { shader, entry, params, bind, threads: pass.threads }));
             }
-            let bytes = result_bytes(part, quantity);
-            commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to }));
-            to += bytes.next_multiple_of(256);
+            if self.finish.is_none() {
+                let bytes = result_bytes(part, quantity);
+                commands.push(Command::Readback(Readback { from: A, bytes, to }));
+                to += bytes.next_multiple_of(256);
+            }
+        }
+        if let Some(channels) = &self.finish {
+            let cell = if self.needs.mean { cell(self.needs.variance) } else { 0 };
+            commands.push(Command::Dispatch(channels.dispatch(self, part, cell)));
+            commands.push(Command::Readback(Readback { from: B, bytes: channels.bytes(part), to: 0 }));
         }
         Recording { sizes: self.sizes(part), tables: Vec::new(), commands }
     }

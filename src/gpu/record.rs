@@ -19,6 +19,9 @@ pub enum Buffer {
     Tables,
     A,
     B,
+    C,
+    /// Results of a first step that a second one reads.
+    D,
 }
 
 /// One dispatch.
@@ -108,6 +111,8 @@ pub struct Sizes {
     pub source: u64,
     pub a: u64,
     pub b: u64,
+    pub c: u64,
+    pub d: u64,
     /// Everything that comes back.
     pub read: u64,
 }
@@ -125,6 +130,8 @@ impl Sizes {
             source: self.source.max(o.source),
             a: self.a.max(o.a),
             b: self.b.max(o.b),
+            c: self.c.max(o.c),
+            d: self.d.max(o.d),
             read: self.read.max(o.read),
         }
     }
@@ -135,11 +142,13 @@ impl Sizes {
             Buffer::Tables => self.tables,
             Buffer::A => self.a,
             Buffer::B => self.b,
+            Buffer::C => self.c,
+            Buffer::D => self.d,
         }
     }
 
     pub fn largest(self) -> u64 {
-        self.params.max(self.tables).max(self.source).max(self.a).max(self.b).max(self.read)
+        self.params.max(self.tables).max(self.source).max(self.a).max(self.b).max(self.c).max(self.d).max(self.read)
     }
 
     /// Bytes of the upload buffer: parameters, tables, then voxels.
@@ -149,7 +158,7 @@ impl Sizes {
 
     /// Bytes of host memory that a slot takes: staging, and on a software adapter everything.
     pub fn host_bytes(self, software: bool) -> u64 {
-        let device = if software { self.upload() + self.a + self.b } else { 0 };
+        let device = if software { self.upload() + self.a + self.b + self.c + self.d } else { 0 };
         self.upload() + self.read + STAMP_BYTES + device
     }
 }
@@ -175,7 +184,7 @@ mod tests {
 
     #[test]
     fn faults_are_seen() {
-        let sizes = Sizes { params: 256, tables: 256, source: 256, a: 512, b: 256, read: 512 };
+        let sizes = Sizes { params: 256, tables: 256, source: 256, a: 512, b: 256, c: 0, d: 0, read: 512 };
         let dispatch = |bind: &[Buffer]| {
             let (shader, params) = (Shader::Sums32, vec![0; 80]);
             Command::Dispatch(Dispatch { shader, entry: 0, params, bind: bind.to_vec(), threads: 1 })

@@ -28,10 +28,11 @@ pub enum Shader {
     Order,
     Moments,
     GaussianVariance,
+    Finish,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 9] = [
+    pub const ALL: [Shader; 10] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -41,6 +42,7 @@ impl Shader {
         Shader::Order,
         Shader::Moments,
         Shader::GaussianVariance,
+        Shader::Finish,
     ];
 
     fn composed(self) -> Composed {
@@ -54,6 +56,7 @@ impl Shader {
             Shader::Order => composed!("common", "window_pass", "window_herk", "window_kept", "window_order"),
             Shader::Moments => composed!("common", "floats", "pairs", "window_pass", "window_herk", "window_moments"),
             Shader::GaussianVariance => composed!("common", "floats", "pairs", "gaussian_taps", "gaussian_variance"),
+            Shader::Finish => composed!("common", "floats", "pairs", "window_finish"),
         }
     }
 
@@ -75,6 +78,7 @@ impl Shader {
         match self {
             Shader::Obscurance => &["sweep"],
             Shader::Gradient => &["slopes"],
+            Shader::Finish => &["finish"],
             _ => &["first", "next"],
         }
     }
@@ -82,7 +86,7 @@ impl Shader {
     /// Storage bindings after the uniform one: read, written, read, written, as many of them as the shader has.
     pub fn bindings(self) -> usize {
         match self {
-            Shader::Obscurance => 4,
+            Shader::Obscurance | Shader::Finish => 4,
             Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient => 3,
             _ => 2,
         }

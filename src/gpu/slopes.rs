@@ -101,7 +101,7 @@ impl SlopesJob {
         Some(SlopesJob { src, dst, at, half, voxel, signed, real, missing, along, scale, vector })
     }
 
-    fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
+    pub(super) fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
         Part::around(self.src, self.at, [self.half; 3], lo, dst)
     }
 
@@ -122,6 +122,8 @@ impl SlopesJob {
             source: rounded((nz * ny * self.pitch(part) * self.voxel) as u64),
             a: rounded(self.result_bytes(part.dst)),
             b: 0,
+            c: 0,
+            d: 0,
             read: rounded(self.result_bytes(part.dst)),
         }
     }

@@ -108,6 +108,8 @@ impl<'a> SweepJob<'a> {
             source: rounded((nz * ny * part.pitch(self.code) * self.code) as u64),
             a: rounded(voxels * 4),
             b: rounded(links),
+            c: 0,
+            d: 0,
             read: rounded(voxels * 4),
         })
     }

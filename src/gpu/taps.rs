@@ -91,6 +91,8 @@ impl TapsJob {
             source: rounded((nz * ny * self.pitch(part) * self.voxel) as u64),
             a: rounded(words([nz, ny, mx])),
             b: rounded(words([nz, my, mx])),
+            c: 0,
+            d: 0,
             read: results.max(1) * rounded(voxels(part.dst) * 4),
         }
     }
@@ -120,12 +122,20 @@ impl TapsJob {
         let starts = self.tables(part, &mut recording.tables);
         for (shader, wanted) in [(MEAN, self.moments.mean), (VARIANCE, self.moments.variance)] {
             if wanted {
-                self.passes(part, shader, starts, &mut recording.commands);
+                self.passes(part, shader, starts, Buffer::A, &mut recording.commands);
                 let place = self.place(part, shader == VARIANCE);
                 let (bytes, to) = (place.len() as u64, place.start as u64);
                 recording.commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to }));
             }
         }
+        recording
+    }
+
+    /// The mean alone, left on the device in `to`.
+    pub(super) fn record_into(&self, part: &Part, to: Buffer) -> Recording {
+        let mut recording = Recording { sizes: self.sizes(part), ..Recording::default() };
+        let starts = self.tables(part, &mut recording.tables);
+        self.passes(part, MEAN, starts, to, &mut recording.commands);
         recording
     }
 
@@ -144,7 +154,7 @@ impl TapsJob {
         })
     }
 
-    fn passes(&self, part: &Part, shader: Shader, starts: [[u32; 2]; 3], commands: &mut Vec<Command>) {
+    fn passes(&self, part: &Part, shader: Shader, starts: [[u32; 2]; 3], last: Buffer, commands: &mut Vec<Command>) {
         let pitch = self.pitch(part);
         let mut strides = [part.src[1] * pitch, pitch, 1];
         let mut extent = part.src;
@@ -172,7 +182,7 @@ impl TapsJob {
                 last: (axis == 0) as u32,
                 ..Taps::default()
             };
-            let [input, output] = [[Buffer::B, Buffer::A], [Buffer::A, Buffer::B], [Buffer::Source, Buffer::A]][axis];
+            let [input, output] = [[Buffer::B, last], [Buffer::A, Buffer::B], [Buffer::Source, Buffer::A]][axis];
             commands.push(Command::Dispatch(Dispatch {
                 shader,
                 entry,

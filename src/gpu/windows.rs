@@ -3,9 +3,9 @@
 
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::facts;
-use super::float_windows::FloatPart;
+use super::float_windows;
 use super::passes::{Job, Part, Quantity, result_bytes};
-use crate::grid::{AnyView, View, Voxel};
+use crate::grid::{AnyView, DType, View, Voxel};
 use crate::kernel::Context;
 use crate::kernel::window::finish::{Sums, Windows, finish};
 use crate::kernel::window::{self, Needs, Place, WindowOut};
@@ -38,8 +38,12 @@ impl Gpu {
         if dst.contains(&0) {
             return Ok(Times::default());
         }
-        let needs = Needs::of(channels.into_iter(), src.dtype().is_float());
-        let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs).map(|j| j.placed(voxel));
+        let needs = Needs::of(channels.iter().copied(), src.dtype().is_float());
+        let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs).map(|j| {
+            // The shader writes f32.
+            let wide = outs.iter().any(|o| o.dst.dtype() != DType::F32);
+            if wide { j.placed(voxel) } else { j.placed(voxel).finished(params, &channels) }
+        });
         let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap())?))) else {
             // Integers are exact, and that a window of floats is too large depends on its radius and the volume alone.
             window::window(src, params, Place::new(at, voxel), outs, cx);
@@ -53,7 +57,7 @@ impl Gpu {
                 let mut done = |bytes: Option<&[u8]>| {
                     let bytes = bytes.unwrap_or_default();
                     if let AnyView::F32(v) = src {
-                        return FloatPart::new(&job, part, bytes)?.finish(v, params, outs, cx);
+                        return float_windows::finish(&job, part, bytes, v, params, outs, cx);
                     }
                     let windows = windows(bytes, part, &job.quantities())?;
                     finish(src, params, job.at, outs, &windows, cx);

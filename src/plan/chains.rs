@@ -3,8 +3,9 @@
 use super::Plan;
 use super::graph::{GradientChannel, Graph, Moment, Step, StepId, StepKind, WireId};
 use crate::gpu::chain::{ChainJob, Extents};
+use crate::gpu::finish::Channels;
 use crate::gpu::slopes::Fit;
-use crate::grid::{DType, Shape};
+use crate::grid::{Border, DType, Shape};
 
 /// By step: the step that reads its results on the device.
 pub fn chains(plan: &Plan) -> Vec<Option<StepId>> {
@@ -29,21 +30,33 @@ fn reader(graph: &Graph, step: StepId, delivered: &[WireId]) -> Option<StepId> {
     (alone && graph.steps[first].inputs[..] == [wire]).then_some(first)
 }
 
-/// A Gaussian mean whose values on the device are its results, and a gradient; neither with a mask.
+/// A Gaussian mean whose values on the device are its results, and a gradient or windows; neither with a mask.
 fn fits(graph: &Graph, first: &Step, second: &Step) -> bool {
     let input = &graph.wires[first.inputs[0]];
     let mean = matches!(&first.kind, StepKind::Gaussian { channels, .. } if channels[..] == [Moment::Mean]);
-    let gradient = matches!(second.kind, StepKind::Gradient { .. });
+    let reads = match &second.kind {
+        StepKind::Gradient { .. } => true,
+        // Elsewhere than at the edge of the volume a window of means needs means; beyond it, those of the border rule.
+        StepKind::Window { params, channels } => {
+            second.border == Border::Clip && Channels::of(params, channels).is_some()
+        }
+        _ => false,
+    };
     let plain = input.affine.is_identity() && input.components == 1;
-    mean && gradient && plain && first.mask.is_none() && second.mask.is_none()
+    mean && reads && plain && first.mask.is_none() && second.mask.is_none()
 }
 
 /// The recording of two chained steps over boxes of these extents; `None` where they run one by one.
 pub fn job(first: &Step, second: &Step, dtype: DType, extents: &Extents) -> Option<ChainJob> {
     let StepKind::Gaussian { sigma, .. } = &first.kind else { return None };
-    let StepKind::Gradient { size, weight, spacing, channels, .. } = &second.kind else { return None };
-    let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
-    ChainJob::new(dtype, extents, *sigma, &fit, channels.contains(&GradientChannel::Vector))
+    match &second.kind {
+        StepKind::Gradient { size, weight, spacing, channels, .. } => {
+            let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
+            ChainJob::gradient(dtype, extents, *sigma, &fit, channels.contains(&GradientChannel::Vector))
+        }
+        StepKind::Window { params, channels } => ChainJob::windows(dtype, extents, *sigma, params, channels, [0; 3]),
+        _ => None,
+    }
 }
 
 /// Extents of chained steps for outputs of `dst` in the middle of a volume: the largest that there are.

@@ -155,7 +155,7 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
         StepKind::Window { params, channels } => {
             let needs = window::Needs::of(channels.iter().copied(), dtype.is_float());
             let job = passes::Job::new(dtype, src, dst, at, params.radius, needs);
-            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+            job.map_or(record::Sizes::default(), |j| j.finished(params, channels).slot(cap))
         }
         StepKind::Obscurance { params, .. } => {
             let prepared = obscurance::Prepared::new(params);

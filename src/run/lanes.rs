@@ -8,6 +8,7 @@ use crate::gpu::{Gpu, GpuError};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
 use crate::kernel::gradient::GradientOut;
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
+use crate::kernel::window::WindowOut;
 use crate::kernel::{Context, pointwise};
 use crate::plan::graph::{GradientChannel, ObscuranceChannel, StepId, StepKind};
 use crate::{Error, Result};
@@ -82,11 +83,7 @@ impl<'a> Engine<'a> {
         let graph = &self.plan.graph;
         let (a, b) = (&graph.steps[first], &graph.steps[second]);
         let (Some(gpu), Some(_)) = (self.lane(first, middle), self.lane(second, region)) else { return Ok(None) };
-        let (StepKind::Gaussian { sigma, .. }, StepKind::Gradient { size, weight, spacing, channels, .. }) =
-            (&a.kind, &b.kind)
-        else {
-            return Ok(None);
-        };
+        let StepKind::Gaussian { sigma, .. } = &a.kind else { return Ok(None) };
         let value = values[a.inputs[0]].as_mut().expect("inputs are made before their readers");
         if self.skip && value.constants().is_some() {
             return Ok(None);
@@ -100,10 +97,21 @@ impl<'a> Engine<'a> {
             dst: region.shape(),
             inner: middle.offset_of(&region),
         };
-        let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
         let wires = b.outputs.iter().map(|&w| &graph.wires[w]);
         let mut outputs: Vec<Value> = wires.map(|w| self.buffers(w.dtype, region, w.components)).collect();
-        let done = gpu.smoothed_gradient(src.view(), &extents, *sigma, &fit, gradient_out(channels, &mut outputs));
+        let done = match &b.kind {
+            StepKind::Gradient { size, weight, spacing, channels, .. } => {
+                let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
+                gpu.smoothed_gradient(src.view(), &extents, *sigma, &fit, gradient_out(channels, &mut outputs))
+            }
+            StepKind::Window { params, channels } => {
+                let outs = channels.iter().zip(&mut outputs);
+                let mut outs: Vec<WindowOut> =
+                    outs.map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, 0) }).collect();
+                gpu.smoothed_window(src.view(), &extents, *sigma, params, region.lo, &mut outs)
+            }
+            _ => Ok(None),
+        };
         src.recycle(self.pool);
         if done.map_err(|e| self.gpu_failed(second, &e))?.is_none() {
             outputs.into_iter().for_each(|v| v.recycle(self.pool));

@@ -1,4 +1,4 @@
-//! Results that stay on the GPU: the gradient of a Gaussian, whose means never come back, equals the two one by one.
+//! Results that stay on the GPU: gradients and windows of a Gaussian, whose means never come back, equal the two one by one.
 
 use std::path::Path;
 
@@ -7,13 +7,14 @@ use occlude::gpu::Gpu;
 use occlude::gpu::chain::Extents;
 use occlude::gpu::facts::tolerance;
 use occlude::gpu::slopes::Fit;
-use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut};
+use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut};
 use occlude::kernel::Context;
 use occlude::kernel::gradient::GradientOut;
 use occlude::kernel::simd::Level;
+use occlude::kernel::window::WindowOut;
 use occlude::plan::Plan;
 use occlude::run::RunOptions;
-use occlude::stage::GradientWeight;
+use occlude::stage::{GradientWeight, Method, Ties, WindowChannel, WindowParams};
 
 use super::common::{Decoded, assert_same, decode, mixed_u16, parse, run_with, u16_bytes, write_npy};
 use super::{adapter, fills};
@@ -43,9 +44,9 @@ fn apart(gpu: &Gpu, volume: &Voxels, shape: Shape, fit: &Fit, wanted: [bool; 2])
     let grown = whole.grow(half);
     let mut padded = vec![0.0f32; grown.voxels()];
     let to = ViewMut::dense(&mut padded, grown.shape());
-    gather::extend(occlude::grid::View::dense(&means, shape), whole, to, grown, whole, Border::Nearest, 0.0);
+    gather::extend(View::dense(&means, shape), whole, to, grown, whole, Border::Nearest, 0.0);
     let mut made: Results = std::array::from_fn(|_| vec![3.0; whole.voxels()]);
-    let src = AnyView::F32(occlude::grid::View::dense(&padded, grown.shape()));
+    let src = AnyView::F32(View::dense(&padded, grown.shape()));
     gpu.gradient(src, fit, Affine::IDENTITY, half, out(&mut made, shape, wanted), &mut cx).unwrap();
     made
 }
@@ -99,6 +100,70 @@ fn in_one_go_is_the_same_as_one_by_one_wherever_the_box_lies() {
                     if let Some(text) = differs(&all, shape, &got, part) {
                         panic!("{name} of {dtype}, size {size}, {part:?}, cap {cap}: {text}");
                     }
+                }
+            }
+        }
+    }
+}
+
+const CHANNELS: [WindowChannel; 5] = [
+    WindowChannel::Mean,
+    WindowChannel::Min,
+    WindowChannel::Std,
+    WindowChannel::Openness(Method::CdfPower, Ties::Le),
+    WindowChannel::Openness(Method::GaussianCdf, Ties::Mid),
+];
+const RADIUS: [usize; 3] = [2, 1, 4];
+
+fn windows(made: &mut [Vec<f32>], shape: Shape) -> Vec<WindowOut<'_>> {
+    let outs = made.iter_mut().zip(CHANNELS);
+    outs.map(|(v, channel)| WindowOut { channel, dst: AnyViewMut::F32(ViewMut::dense(v, shape)) }).collect()
+}
+
+/// Every channel of the windows of the means of a box: in one go from what it needs, or one by one.
+fn window_results(gpu: &Gpu, volume: &Voxels, shape: Shape, part: Region, in_one_go: bool) -> Option<Vec<Vec<f32>>> {
+    let params = WindowParams { radius: RADIUS, affine: Affine::IDENTITY, missing: None, solid_low: true };
+    let whole = Region::whole(shape);
+    let middle = part.grow(RADIUS).clip(&whole);
+    let src = middle.grow(SIGMA.map(|s| (3.0 * s).ceil() as usize)).clip(&whole);
+    let mut brick = Voxels::zeroed(volume.dtype(), src.voxels());
+    gather::copy_common(volume.view(shape), whole, brick.view_mut(src.shape()), src);
+    let (dst, at, inner) = (part.shape(), src.offset_of(&middle), middle.offset_of(&part));
+    let mut made: Vec<Vec<f32>> = CHANNELS.iter().map(|_| vec![3.0; part.voxels()]).collect();
+    let mut outs = windows(&mut made, dst);
+    let view = brick.view(src.shape());
+    if in_one_go {
+        let extents = Extents { src: src.shape(), middle: middle.shape(), at, dst, inner };
+        let done = gpu.smoothed_window(view, &extents, SIGMA, &params, part.lo, &mut outs);
+        return done.unwrap_or_else(|e| panic!("{e}")).map(|_| made);
+    }
+    let mut cx = Context { level: Level::detect(), scratch: &mut Scratch::new() };
+    let mut means = vec![0.0f32; middle.voxels()];
+    let mean = AnyViewMut::F32(ViewMut::dense(&mut means, middle.shape()));
+    gpu.gaussian(view, SIGMA, Affine::IDENTITY, at, Some(mean), None, &mut cx).unwrap();
+    let means = AnyView::F32(View::dense(&means, middle.shape()));
+    gpu.window(means, &params, inner, part.lo, &mut outs, &mut cx).unwrap();
+    Some(made)
+}
+
+#[test]
+fn windows_in_one_go_are_the_same_as_one_by_one() {
+    let Some(mut gpu) = adapter() else { return };
+    for shape in [[12, 15, 33], [1, 1, 40], [3, 20, 2]] {
+        for dtype in [DType::U8, DType::I16] {
+            for (name, volume) in fills(dtype, shape) {
+                let whole = Region::whole(shape);
+                let inside = Region::new([0; 3], shape.map(|n| n as i64 * 3 / 4 + 1)).clip(&whole);
+                for (part, cap) in [(whole, 1 << 30), (inside, 1 << 30), (whole, 60_000)] {
+                    gpu.set_cap(1 << 30);
+                    let apart = window_results(&gpu, &volume, shape, part, false);
+                    gpu.set_cap(cap);
+                    let got = window_results(&gpu, &volume, shape, part, true);
+                    let bits = |r: Option<Vec<Vec<f32>>>| {
+                        let r = r.expect("nothing is left");
+                        r.into_iter().map(|v| v.into_iter().map(f32::to_bits).collect()).collect::<Vec<Vec<u32>>>()
+                    };
+                    assert_eq!(bits(apart), bits(got), "{name} of {dtype} {shape:?}, {part:?}, cap {cap}");
                 }
             }
         }
@@ -162,6 +227,13 @@ chunk = 16
 shard = 32
 "#;
 
+/// The same with windows in the place of the gradient.
+fn with_windows() -> String {
+    let stage = "op = \"box\"\nradius = [2, 3, 4]\ninput = \"bell.mean\"";
+    let text = CONFIG.replacen("op = \"gradient\"\ninput = \"bell.mean\"", stage, 1);
+    text.replacen("[\"slope.magnitude\", \"slope.vector\"]", "[\"slope.std\", \"slope.max\"]", 1)
+}
+
 fn folder(voxels: &[u16], shape: Shape) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(voxels));
@@ -207,6 +279,23 @@ fn a_run_keeps_the_means_on_the_gpu_and_shows_no_brick() {
 }
 
 #[test]
+fn a_run_keeps_the_means_of_windows_on_the_gpu() {
+    let Some(_) = adapter() else { return };
+    let shape = [30, 40, 50];
+    let dir = folder(&mixed_u16(shape), shape);
+    let text = with_windows();
+    assert_eq!(chained(dir.path(), &text), [true, false]);
+    let all = run(dir.path(), &text, &[]);
+    assert_same("other bricks", &all, &run(dir.path(), &text, &["run.brick=[32, 16, 64]"]));
+    let read = format!("{text}[output.bell]\npath = \"out/bell.zarr\"\nfrom = \"bell.mean\"\nchunk = 16\n");
+    assert_eq!(chained(dir.path(), &read), [false, false]);
+    assert_same("one by one", &all, &run(dir.path(), &read, &[]));
+    // Beyond the edge of the volume a window sees means that the border's rule makes of means: those come back.
+    let mirrored = text.replacen("radius =", "border = \"reflect\"\nradius =", 1);
+    assert_eq!(chained(dir.path(), &mirrored), [false, false]);
+}
+
+#[test]
 fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
     let Some(_) = adapter() else { return };
     let shape = [20, 20, 70];
@@ -217,7 +306,7 @@ fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
     let gpu = adapter().expect("there was one");
     let extents = Extents { src: shape, middle: shape, at: [0; 3], dst: shape, inner: [0; 3] };
     let mut made: Results = std::array::from_fn(|_| vec![3.0; voxels.len()]);
-    let volume = AnyView::U16(occlude::grid::View::dense(&voxels, shape));
+    let volume = AnyView::U16(View::dense(&voxels, shape));
     let out = out(&mut made, shape, [true, false]);
     assert!(gpu.smoothed_gradient(volume, &extents, [0.2; 3], &fit(5), out).unwrap().is_none(), "too small for f32");
     let narrow = ["stage.bell.sigma=[0.2, 0.2, 0.2]", "run.brick=[16, 16, 16]"];
