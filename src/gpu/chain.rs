@@ -19,6 +19,7 @@ pub struct ChainJob {
 
 /// The second step.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[allow(clippy::large_enum_variant)] // one per call, and none is kept
 pub enum Reader {
     Slopes(SlopesJob),
     /// Whose results the device makes itself.

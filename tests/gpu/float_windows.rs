@@ -116,7 +116,7 @@ fn hostile(shape: Shape) -> Vec<(&'static str, Voxels)> {
         ("far offset", &|i| -8e6 + (noise(i) * 16.0).round()),
         ("step of 1e6", &|i| if i % nx < nx / 3 { 1e6 + noise(i) } else { noise(i) }),
         ("outlier", &|i| if i == 321 { 1e6 } else { noise(i) }),
-        ("gaps", &|i| if hash(2, i as u64) % 3 == 0 { f64::NAN } else { 100.0 + noise(i) }),
+        ("gaps", &|i| if hash(2, i as u64).is_multiple_of(3) { f64::NAN } else { 100.0 + noise(i) }),
         ("an infinity", &|i| if i == 400 { f64::INFINITY } else { noise(i) }),
         ("small", &|i| noise(i) * 1e-12),
         ("large", &|i| noise(i) * 1e25),

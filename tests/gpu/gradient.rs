@@ -75,7 +75,8 @@ fn differs(cpu: &[Vec<f64>; 4], gpu: &[Vec<f64>; 4], ranges: &[f64], case: &Case
         let bound = tolerance::GRADIENT * range * case.slope.abs() / least + 1e-44;
         let same = a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan();
         // f32 rounds each once more.
-        !same && !((a - b).abs() <= bound + 2f64.powi(-24) * a.abs())
+        let close = (a - b).abs() <= bound + 2f64.powi(-24) * a.abs();
+        !same && !close
     };
     (0..4).find_map(|c| {
         let i = (0..ranges.len()).find(|&i| apart(cpu[c][i], gpu[c][i], ranges[i]))?;
