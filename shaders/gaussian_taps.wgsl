@@ -36,11 +36,6 @@ struct Taps {
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> weights: array<u32>;
 
-fn integer_at(index: u32) -> f32 {
-    let code = unpacked(input[index >> p.packing], index, p.packing);
-    return f32(i32(code ^ p.sign) - i32(p.sign));
-}
-
 // Where an output's centre stands in the input, how many taps exist before and after it, where its weights start, its place
 // among the outputs along the axis, and its own.
 struct Centre {

@@ -6,26 +6,6 @@
 // three words: mean (high, low), variance, of which the last pass keeps the variance; 3 storage, read: bits of f32 weights, `radius` for each output along the axis, and
 // one more for its centre. Workgroup: gaussian_taps.wgsl.
 
-struct Cell {
-    mean: vec2<f32>,
-    variance: f32,
-}
-
-fn cell_at(index: u32, packed: bool) -> Cell {
-    if packed {
-        return Cell(vec2<f32>(integer_at(index), 0.0), 0.0);
-    }
-    let start = 3u * index;
-    let mean = vec2<f32>(bitcast<f32>(input[start]), bitcast<f32>(input[start + 1u]));
-    return Cell(mean, bitcast<f32>(input[start + 2u]));
-}
-
-// What a tap adds to the variance.
-fn spread(cell: Cell, mean: vec2<f32>, w: f32) -> f32 {
-    let d = distance(cell.mean, mean);
-    return w * (cell.variance + d * d);
-}
-
 fn smooth_at(at: Centre, packed: bool) {
     let c = cell_at(at.here, packed);
     var moved = 0.0;

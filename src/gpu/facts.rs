@@ -97,16 +97,31 @@ pub fn gradient(dtype: DType, normals: bool) -> Result<(), &'static str> {
     }
 }
 
+/// Whether the chain of an occlusion map over voxels of this type has a GPU kernel, or why not. It also asks for
+/// [`GpuFacts::exact_floats`].
+pub fn occlusion_map(dtype: DType, missing: bool) -> Result<(), &'static str> {
+    match dtype {
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
+            Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
+        }
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 => Ok(()),
+        _ => Err("no GPU kernel for an occlusion map of 32-bit integers or floats: runs on the CPU"),
+    }
+}
+
+/// Why an occlusion map stays on the CPU where a cell of its last level sees too many voxels.
+pub const MAP_TOO_LARGE: &str = "a cell of the occlusion map does not fit the GPU's buffers: runs on the CPU";
+
 /// How far floats of the GPU may be from the CPU's. What is not here is the same bit for bit.
 pub mod tolerance {
     /// Components and magnitudes of gradients, times the range of the window's values over the (least) spacing. The sums of
     /// up to 27 products in f32: 27 * 2^-24 at worst, of weights that together are less than the inverse of the spacing.
     pub const GRADIENT: f64 = 2e-6;
 
-    /// Means of windows of f32, times the range of the window's values: merges of pairs round a step toward another mean to
+    /// Means of windows of f32, and of cells of occlusion maps, times the range of the window's values: merges of pairs round a step toward another mean to
     /// f32, at most half of the distance. The second moment E\[v^2\] has this times its largest magnitude.
     pub const MEAN: f64 = 1e-6;
-    /// Variances of windows of f32 and of Gaussians, relative (SPEC 5.2).
+    /// Variances of windows of f32, of Gaussians and of cells of occlusion maps, relative (SPEC 5.2).
     pub const VARIANCE: f64 = 1e-5;
     /// Openness (SPEC 5.6).
     pub const OPENNESS: f64 = 1e-5;

@@ -9,6 +9,7 @@
 //! | `shaders` | their texts, put together of what they share |
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
+//! | `maps`, `occlusion` | occlusion maps recorded, and called |
 //! | `finish` | results of f32 windows made of moments there |
 //! | `chain`, `smoothed` | a Gaussian and what reads it, recorded together and called |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
@@ -25,7 +26,9 @@ pub mod finish;
 mod float_windows;
 mod gaussian;
 mod gradient;
+pub mod maps;
 mod obscurance;
+mod occlusion;
 pub mod pairs;
 pub mod passes;
 mod probe;

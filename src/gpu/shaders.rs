@@ -29,10 +29,11 @@ pub enum Shader {
     Moments,
     GaussianVariance,
     Finish,
+    MapPool,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 10] = [
+    pub const ALL: [Shader; 11] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -43,6 +44,7 @@ impl Shader {
         Shader::Moments,
         Shader::GaussianVariance,
         Shader::Finish,
+        Shader::MapPool,
     ];
 
     fn composed(self) -> Composed {
@@ -51,11 +53,14 @@ impl Shader {
             Shader::Sums32 => composed!("common", "window_pass", "window_sums", "window_sums32"),
             Shader::Sums64 => composed!("common", "window_pass", "window_sums", "window_sums64"),
             Shader::Obscurance => composed!("common", "obscurance"),
-            Shader::Gaussian => composed!("common", "floats", "gaussian_taps", "gaussian"),
+            Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian"),
             Shader::Gradient => composed!("common", "gradient"),
             Shader::Order => composed!("common", "window_pass", "window_herk", "window_kept", "window_order"),
             Shader::Moments => composed!("common", "floats", "pairs", "window_pass", "window_herk", "window_moments"),
-            Shader::GaussianVariance => composed!("common", "floats", "pairs", "gaussian_taps", "gaussian_variance"),
+            Shader::GaussianVariance => {
+                composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_variance")
+            }
+            Shader::MapPool => composed!("common", "floats", "pairs", "cells", "map_pool"),
             Shader::Finish => composed!("common", "floats", "pairs", "window_finish"),
         }
     }
@@ -87,7 +92,7 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Obscurance | Shader::Finish => 4,
-            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient => 3,
+            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
             _ => 2,
         }
     }

@@ -139,7 +139,16 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
         });
         slot_sizes(plan, group, step, cap).max(chained)
     });
-    facts::SLOTS * sizes.fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
+    let maps = group.outputs.iter().filter(|&&o| plan.map_on_gpu(o)).filter_map(|&o| {
+        // A brick in the middle of the map, where it sees most.
+        let job = plan.outputs[o].map_job(&plan.graph)?;
+        let shape = plan.outputs[o].region.shape();
+        let lo: [i64; 3] =
+            std::array::from_fn(|a| (shape[a].saturating_sub(group.brick.shape[a]) / 2 / 16 * 16) as i64);
+        let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + group.brick.shape[a] as i64));
+        Some(job.slot(brick.clip(&Region::whole(shape)), cap))
+    });
+    facts::SLOTS * sizes.chain(maps).fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
 }
 
 /// Largest buffers that a step needs on the GPU.

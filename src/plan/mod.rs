@@ -80,7 +80,7 @@ impl Plan {
             n => n,
         };
         let graph = lowered.graph;
-        let (placement, gpu) = placement(config, &graph, find_gpu)?;
+        let (placement, gpu) = placement(config, &graph, &outputs, find_gpu)?;
         let warnings = warnings(&graph);
         let mut plan = Plan {
             groups: Vec::new(),
@@ -133,6 +133,18 @@ impl Plan {
         (config.run.device == Device::Auto).then(|| format!("device = \"auto\": running on the CPU, {why}"))
     }
 
+    /// Device and reason of the occlusion map of output `o`; they follow those of the steps.
+    pub fn map_placement(&self, o: usize) -> Option<&(String, &'static str, String)> {
+        self.outputs[o].map.as_ref()?;
+        let before = self.outputs[..o].iter().filter(|p| p.map.is_some()).count();
+        self.placement.get(self.graph.steps.len() + before)
+    }
+
+    /// Whether the occlusion map of output `o` is made on the GPU.
+    pub fn map_on_gpu(&self, o: usize) -> bool {
+        self.map_placement(o).is_some_and(|p| p.1 == "gpu")
+    }
+
     /// Whether a step was placed on the GPU.
     pub fn on_gpu(&self, step: StepId) -> bool {
         self.placement[step].1 == "gpu"
@@ -164,7 +176,7 @@ impl Plan {
 /// How the reason begins where a GPU would have been used.
 const NO_GPU: &str = "no GPU: ";
 
-/// Stage, device and reason of every step.
+/// Stage, device and reason of every step, then of every output that is an occlusion map.
 pub type Placement = Vec<(String, &'static str, String)>;
 
 /// Whether a step that reads `input` has a GPU kernel, or why not.
@@ -209,26 +221,53 @@ fn exact(graph: &Graph, step: &graph::Step) -> bool {
 }
 
 /// Device of every step. An adapter is looked for where one is demanded, or where `auto` has a step for it.
-fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement, Option<GpuFacts>)> {
-    let supported = |s: &graph::Step| gpu_kernel(s, &graph.wires[s.inputs[0]]);
-    let any = graph.steps.iter().any(|s| supported(s).is_ok());
+fn placement(
+    config: &Config,
+    graph: &Graph,
+    outputs: &[OutputPlan],
+    find: FindGpu,
+) -> Result<(Placement, Option<GpuFacts>)> {
+    // Name, whether there is a kernel, whether it asks for exact floats, and an occlusion map's output.
+    let steps = graph.steps.iter().map(|s| {
+        let kernel = gpu_kernel(s, &graph.wires[s.inputs[0]]);
+        (s.stages.join("+"), kernel, exact(graph, s), None)
+    });
+    let maps = outputs.iter().filter_map(|o| o.map.as_ref().map(|m| (o, m))).map(|(o, m)| {
+        let wire = &graph.wires[m.source];
+        let kernel = facts::occlusion_map(wire.dtype, wire.missing.is_some());
+        (config.outputs[o.index].from[0].name.clone(), kernel, true, Some(o))
+    });
+    let work: Vec<_> = steps.chain(maps).collect();
+    let any = work.iter().any(|w| w.1.is_ok());
     let found = match config.run.device {
         Device::Cpu => None,
         Device::Auto => any.then(find),
         Device::Gpu | Device::GpuSoftware => Some(Ok(find().map_err(|why| no_such_gpu(config, &why))?)),
     };
-    let place = |s: &graph::Step| match (&found, supported(s)) {
+    let place = |kernel: Result<(), &'static str>, exact: bool, map: Option<&OutputPlan>| match (&found, kernel) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
-        (Some(Ok(gpu)), Ok(())) if exact(graph, s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if exact && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if map.is_some_and(|o| !map_fits(graph, o, gpu.buffer_cap(config.run.memory))) => {
+            ("cpu", facts::MAP_TOO_LARGE.to_string())
+        }
         (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),
     };
-    let places: Placement =
-        graph.steps.iter().map(|s| (s, place(s))).map(|(s, p)| (s.stages.join("+"), p.0, p.1)).collect();
+    let places: Placement = work
+        .into_iter()
+        .map(|(name, kernel, exact, map)| {
+            let (device, reason) = place(kernel, exact, map);
+            (name, device, reason)
+        })
+        .collect();
     let used = places.iter().any(|p| p.1 == "gpu");
     Ok((places, found.and_then(|f| f.ok()).filter(|_| used)))
+}
+
+fn map_fits(graph: &Graph, output: &OutputPlan, cap: u64) -> bool {
+    output.map_job(graph).is_some_and(|job| job.fits(cap))
 }
 
 /// A GPU that was demanded and is not there: the file and line that ask for it, what was found, what would be accepted. The

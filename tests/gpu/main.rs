@@ -9,6 +9,7 @@ mod common;
 mod float_windows;
 mod gaussian;
 mod gradient;
+mod maps;
 mod obscurance;
 mod runs;
 mod windows;
