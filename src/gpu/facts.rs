@@ -37,7 +37,7 @@ pub const LEVELS: &str = "no GPU kernel for method \"levels\": runs on the CPU";
 pub const SLOTS: u64 = 3;
 
 impl GpuFacts {
-    /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to seven buffers' worth
+    /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to nine buffers' worth
     /// per slot) and a dispatch stays short. Larger boxes are cut.
     pub fn buffer_cap(&self, memory: u64) -> u64 {
         self.most_bytes.min((memory / 48).clamp(256 << 10, 256 << 20))

@@ -222,7 +222,7 @@ mod tests {
             for brick in [Region::whole(shape), Region::new([16, 0, 32], [37, 32, 71])] {
                 for cap in [1 << 30, 400_000] {
                     let parts = job.parts(brick, cap).unwrap();
-                    assert_eq!(parts.len() == 1, cap == 1 << 30 || brick.voxels() < 20_000);
+                    assert_eq!(parts.len() > 1, cap < 1 << 30 && brick == Region::whole(shape));
                     for k in 1..4 {
                         let cells: usize = parts.iter().map(|p| job.own(k, *p).voxels()).sum();
                         assert_eq!(cells, job.own(k, brick).voxels());
