@@ -161,7 +161,7 @@ fn the_comparison_can_fail() {
     let with = |change: &dyn Fn(&mut Moments)| {
         let mut other = level.clone();
         change(&mut other);
-        differs(&[level.clone()], &[other], 1000.0)
+        differs(std::slice::from_ref(&level), &[other], 1000.0)
     };
     assert_eq!(with(&|_| ()), None);
     assert_eq!(with(&|m| m.mean[3] += 9e-4), None);
