@@ -1,8 +1,8 @@
 //! The GPU lane beside the CPU kernels (one thread) on the same brick, and a stream of bricks beside the sum of its parts.
 //!
-//! `cargo bench --bench gpu`: uses a hardware adapter, else a software one, and says which. Figures of a software adapter
-//! (lavapipe) say nothing about a GPU's speed. Results are compared with the CPU's before a time is printed; a wrong one ends
-//! the bench.
+//! `cargo bench --bench gpu [-- WORD ...]` (only rows that hold a word, such as `gradient` or `f32`): uses a hardware adapter,
+//! else a software one, and says which. Figures of a software adapter (lavapipe) say nothing about a GPU's speed. Results are
+//! compared with the CPU's before a time is printed; a wrong one ends the bench.
 //!
 //! Columns, in ms: by the wall clock `pack` (host writes voxels into the mapped staging buffer), `device` (from submission
 //! until results are mapped), `finish` (host turns sums into results), `whole` (the call); by the device's own time stamps
@@ -312,10 +312,15 @@ fn main() {
         "kernel", "type", "pack", "device", "finish", "whole", "up", "compute", "back", "cpu"
     );
     let shape = [size; 3];
+    let words: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
+    let wanted = |case: &Case, dtype: DType| {
+        let row = format!("{} {dtype}", case.name);
+        words.is_empty() || words.iter().any(|w| row.contains(w.as_str()))
+    };
     let mut scratch = Scratch::new();
     for dtype in [DType::U8, DType::U16, DType::F32] {
         let volume = noise(dtype, shape);
-        for case in cases().iter().filter(|c| c.takes(dtype)) {
+        for case in cases().iter().filter(|c| c.takes(dtype) && wanted(c, dtype)) {
             let (mut cpu, mut got) = (case.outputs(dtype, shape), case.outputs(dtype, shape));
             let mut best = (f64::INFINITY, Times::default());
             let mut host = f64::INFINITY;
