@@ -1,7 +1,8 @@
 //! The GPU lane beside the CPU kernels (one thread) on the same brick, and a stream of bricks beside the sum of its parts.
 //!
-//! `cargo bench --bench gpu`: uses a hardware adapter, else a software one, and says which. Figures of a software adapter
-//! (lavapipe) say nothing about a GPU's speed. Results are compared with the CPU's first; wrong ones are not timed.
+//! `cargo bench --bench gpu [-- WORD ...]` (only rows that hold a word, such as `gradient` or `f32`): uses a hardware adapter,
+//! else a software one, and says which. Figures of a software adapter (lavapipe) say nothing about a GPU's speed. Results are
+//! compared with the CPU's before a time is printed; a wrong one ends the bench.
 //!
 //! Columns, in ms: by the wall clock `pack` (host writes voxels into the mapped staging buffer), `device` (from submission
 //! until results are mapped), `finish` (host turns sums into results), `whole` (the call); by the device's own time stamps
@@ -12,21 +13,29 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use occlude::brick::{Scratch, Voxels};
-use occlude::gpu::facts::SLOTS;
-use occlude::gpu::{Gpu, GpuKind, Times};
-use occlude::grid::{Affine, AnyViewMut, DType, Region, Shape, ViewMut};
+use occlude::gpu::chain::Extents;
+use occlude::gpu::facts::{SLOTS, tolerance};
+use occlude::gpu::slopes::Fit;
+use occlude::gpu::{Gpu, GpuError, GpuKind, Times};
+use occlude::grid::{Affine, AnyView, AnyViewMut, DType, Region, Shape, ViewMut};
+use occlude::kernel::gradient::{GradientOut, gradient};
 use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
 use occlude::kernel::simd::Level;
 use occlude::kernel::window::{Place, WindowOut, window};
 use occlude::kernel::{Context, gaussian};
-use occlude::stage::{DirectionSet, DirectionWeights, Method, Rho, Ties, WindowChannel, WindowParams};
+use occlude::stage::{DirectionSet, DirectionWeights, GradientWeight, Method, Rho, Ties, WindowChannel, WindowParams};
 
 const ROUNDS: usize = 3;
 
 /// What is timed.
 enum Kernel {
     Window(Vec<WindowChannel>, usize),
-    Gaussian(f64),
+    /// Sigma; with the variance.
+    Gaussian(f64, bool),
+    /// Magnitude of a window of 3 or 5 voxels.
+    Gradient(usize),
+    /// Magnitude of 5^3 voxels of a Gaussian mean, which stays on the device.
+    Smoothed(f64),
     /// Directions, distance.
     Obscurance(Prepared),
 }
@@ -70,7 +79,12 @@ fn cases() -> Vec<Case> {
         }
     }
     for sigma in [2.0, 6.0] {
-        list.push(Case { name: format!("gaussian s={sigma}"), kernel: Kernel::Gaussian(sigma) });
+        list.push(Case { name: format!("gaussian s={sigma}"), kernel: Kernel::Gaussian(sigma, false) });
+        list.push(Case { name: format!("gaussian+variance s={sigma}"), kernel: Kernel::Gaussian(sigma, true) });
+        list.push(Case { name: format!("gradient of s={sigma}"), kernel: Kernel::Smoothed(sigma) });
+    }
+    for size in [3, 5] {
+        list.push(Case { name: format!("gradient {size}"), kernel: Kernel::Gradient(size) });
     }
     for (directions, max_distance) in [(12, 64.0), (42, 64.0), (42, 256.0), (162, 64.0)] {
         let params = ObscuranceParams {
@@ -92,7 +106,26 @@ fn cases() -> Vec<Case> {
 
 impl Case {
     fn takes(&self, dtype: DType) -> bool {
-        dtype != DType::F32 || matches!(self.kernel, Kernel::Obscurance(_))
+        dtype != DType::F32 || !matches!(self.kernel, Kernel::Gaussian(..) | Kernel::Smoothed(_))
+    }
+
+    /// How far a result may be from the CPU's, in ranges of the values (up to 2^16) or of itself; 0: not at all.
+    fn tolerance(&self, dtype: DType) -> f64 {
+        match self.kernel {
+            Kernel::Window(..) if dtype == DType::F32 => tolerance::VARIANCE,
+            Kernel::Gaussian(_, true) => tolerance::VARIANCE,
+            Kernel::Gradient(_) | Kernel::Smoothed(_) => 2.0 * tolerance::GRADIENT,
+            _ => 0.0,
+        }
+    }
+
+    /// Extent of the outputs: windows of gradients stay inside the volume.
+    fn extent(&self, shape: Shape) -> Shape {
+        match self.kernel {
+            Kernel::Gradient(size) => shape.map(|n| n - size + 1),
+            Kernel::Smoothed(_) => shape.map(|n| n - 4),
+            _ => shape,
+        }
     }
 
     fn outputs(&self, dtype: DType, shape: Shape) -> Vec<Voxels> {
@@ -102,9 +135,10 @@ impl Case {
         };
         let types = match &self.kernel {
             Kernel::Window(channels, _) => channels.iter().map(of).collect(),
+            Kernel::Gaussian(_, true) => vec![DType::F32; 2],
             _ => vec![DType::F32],
         };
-        types.into_iter().map(|t| Voxels::zeroed(t, shape.iter().product())).collect()
+        types.into_iter().map(|t| Voxels::zeroed(t, self.extent(shape).iter().product())).collect()
     }
 
     /// Seconds of a call, and its phases where it ran on the device; `None` for the CPU kernel.
@@ -127,21 +161,41 @@ impl Case {
                 let mut outs: Vec<WindowOut> =
                     outs.map(|(v, c)| WindowOut { channel: *c, dst: v.view_mut(shape) }).collect();
                 match gpu {
-                    Some(gpu) => gpu.window(src, &p, [0; 3], &mut outs, &mut cx),
+                    Some(gpu) => gpu.window(src, &p, [0; 3], [0; 3], &mut outs, &mut cx),
                     None => {
                         window(src, &p, Place::whole([0; 3]), &mut outs, &mut cx);
                         Ok(Times::default())
                     }
                 }
             }
-            Kernel::Gaussian(sigma) => {
+            Kernel::Gaussian(sigma, _) => {
                 let (sigma, affine) = ([*sigma; 3], Affine::IDENTITY);
-                let mut mean = out[0].view_mut(shape);
+                let mut views = out.iter_mut().map(|v| v.view_mut(shape));
+                let (mean, variance) = (views.next(), views.next());
                 match gpu {
-                    Some(gpu) => gpu.gaussian(src, sigma, affine, [0; 3], &mut mean, &mut cx),
+                    Some(gpu) => gpu.gaussian(src, sigma, affine, [0; 3], mean, variance, &mut cx),
                     None => {
-                        gaussian::gaussian(src, sigma, affine, None, [0; 3], Some(mean), None, &mut cx);
+                        gaussian::gaussian(src, sigma, affine, None, [0; 3], mean, variance, &mut cx);
                         Ok(Times::default())
+                    }
+                }
+            }
+            Kernel::Gradient(size) => gradient_on(gpu, *size, src, out[0].view_mut(self.extent(shape)), &mut cx),
+            Kernel::Smoothed(sigma) => {
+                let (dst, sigma) = (self.extent(shape), [*sigma; 3]);
+                let magnitude = out[0].view_mut(dst);
+                match gpu {
+                    Some(gpu) => {
+                        let extents = Extents { src: shape, middle: shape, at: [0; 3], dst, inner: [2; 3] };
+                        let out = GradientOut { magnitude: Some(magnitude), vector: None };
+                        let done = gpu.smoothed_gradient(src, &extents, sigma, &fit(5), out);
+                        done.map(|t| t.expect("means of noise lie within f32"))
+                    }
+                    None => {
+                        let mut means = Voxels::zeroed(DType::F32, shape.iter().product());
+                        let mean = Some(means.view_mut(shape));
+                        gaussian::gaussian(src, sigma, Affine::IDENTITY, None, [0; 3], mean, None, &mut cx);
+                        gradient_on(None, 5, means.view(shape), magnitude, &mut cx)
                     }
                 }
             }
@@ -155,14 +209,45 @@ impl Case {
     }
 }
 
+fn fit(size: usize) -> Fit {
+    Fit { size, weight: GradientWeight::Distance, spacing: [1.0; 3], missing: None }
+}
+
+fn gradient_on(
+    gpu: Option<&Gpu>,
+    size: usize,
+    src: AnyView,
+    magnitude: AnyViewMut,
+    cx: &mut Context,
+) -> Result<Times, GpuError> {
+    let out = GradientOut { magnitude: Some(magnitude), vector: None };
+    let (Fit { weight, spacing, missing, .. }, at) = (fit(size), [size / 2; 3]);
+    match gpu {
+        Some(gpu) => gpu.gradient(src, &fit(size), Affine::IDENTITY, at, out, cx),
+        None => {
+            gradient(src, size, weight, spacing, Affine::IDENTITY, missing, at, out, cx);
+            Ok(Times::default())
+        }
+    }
+}
+
+/// Whether every voxel is as near to its twin as it has to be.
+fn agree(a: &Voxels, b: &Voxels, tolerance: f64) -> bool {
+    if tolerance == 0.0 {
+        return a.as_bytes() == b.as_bytes();
+    }
+    let most = (0..a.len()).map(|i| a.at(i).abs()).fold(1.0, f64::max).max(65536.0);
+    (0..a.len()).all(|i| (a.at(i) - b.at(i)).abs() <= tolerance * most)
+}
+
 fn sweep_on(
     gpu: Option<&Gpu>,
     sweep: &Prepared,
-    src: occlude::grid::AnyView,
+    src: AnyView,
     whole: Region,
     mut view: ViewMut<f32>,
     cx: &mut Context,
-) -> Result<Times, occlude::gpu::GpuError> {
+) -> Result<Times, GpuError> {
     match gpu {
         Some(gpu) => gpu.obscurance(sweep, src, whole, whole, &mut view, cx),
         None => {
@@ -227,10 +312,15 @@ fn main() {
         "kernel", "type", "pack", "device", "finish", "whole", "up", "compute", "back", "cpu"
     );
     let shape = [size; 3];
+    let words: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
+    let wanted = |case: &Case, dtype: DType| {
+        let row = format!("{} {dtype}", case.name);
+        words.is_empty() || words.iter().any(|w| row.contains(w.as_str()))
+    };
     let mut scratch = Scratch::new();
     for dtype in [DType::U8, DType::U16, DType::F32] {
         let volume = noise(dtype, shape);
-        for case in cases().iter().filter(|c| c.takes(dtype)) {
+        for case in cases().iter().filter(|c| c.takes(dtype) && wanted(c, dtype)) {
             let (mut cpu, mut got) = (case.outputs(dtype, shape), case.outputs(dtype, shape));
             let mut best = (f64::INFINITY, Times::default());
             let mut host = f64::INFINITY;
@@ -239,7 +329,7 @@ fn main() {
                 best = if one.0 < best.0 { one } else { best };
                 host = host.min(case.call(None, &volume, shape, &mut cpu, &mut scratch).0);
             }
-            if cpu.iter().zip(&got).any(|(a, b)| a.as_bytes() != b.as_bytes()) {
+            if !cpu.iter().zip(&got).all(|(a, b)| agree(a, b, case.tolerance(dtype))) {
                 println!("{} {dtype}: WRONG", case.name);
                 std::process::exit(1);
             }
@@ -267,7 +357,10 @@ fn main() {
         "kernel", "type", "1 thread", "ring", "pack", "finish", "device"
     );
     let volume = noise(DType::U8, shape);
-    for case in cases().iter().filter(|c| ["cdf_power r=10", "obscurance 42 d=64"].contains(&c.name.as_str())) {
+    for case in cases()
+        .iter()
+        .filter(|c| ["cdf_power r=10", "gradient of s=2", "obscurance 42 d=64"].contains(&c.name.as_str()))
+    {
         stream(&gpu, case, &volume, shape);
     }
 }

@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
-"""CuPy's uniform, minimum and maximum filters and torch's pooling on a GPU, beside `cargo bench --bench gpu`.
+"""CuPy's uniform, minimum, maximum and Gaussian filters and gradients and torch's pooling on a GPU, beside `cargo bench
+--bench gpu`.
 
     pip install numpy cupy-cuda12x torch
     cargo bench --bench gpu && python benches/gpu_rivals.py
 
 The same extents, radii and types as the bench, noise, medians of ten after a warm-up, by events of the device; copies to
 and from the device are timed apart. CuPy with mode "nearest" and its default "reflect". torch pools floats only, pads with
-nothing for max (-inf) and counts existing voxels for the mean, as occlude does. Every result is compared with SciPy on a
+nothing for max (-inf) and counts existing voxels for the mean, as occlude does. CuPy has no gradient by regression: the
+nearest are the gradient magnitude of a Gaussian (its derivatives, where occlude takes the regression of the mean) and
+Sobel's, whose window has 3 voxels. Every result is compared with SciPy on a
 small volume first; one that differs is said so beside its time. Without a GPU the script says what is missing, and exits
 with 3.
 """
@@ -76,6 +79,40 @@ def rows_of_cupy(cupy, filters):
                     yield f"CuPy {name} {mode}", dtype, radius, ms, "" if same else "differs from SciPy"
 
 
+def smooth_rows(cupy, filters):
+    """Gaussians cut at three sigma, and gradients."""
+    import numpy as np
+    import scipy.ndimage
+
+    small = np.random.default_rng(4).integers(0, 200, (31, 40, 53)).astype("float32")
+    rng = cupy.random.default_rng(5)
+    for dtype in ["uint8", "uint16"]:
+        v = rng.integers(0, 256 if dtype == "uint8" else 65536, (SIZE,) * 3).astype(dtype)
+        out = cupy.empty(v.shape, "float32")
+
+        def sobel(module, a):
+            parts = [module.sobel(a, axis, mode="nearest") for axis in range(3)]
+            return (parts[0] ** 2 + parts[1] ** 2 + parts[2] ** 2) ** 0.5
+
+        f = v.astype("float32")
+        cases = []
+        for sigma in [2, 6]:
+            kind = dict(mode="nearest", truncate=3.0)
+            cases.append((f"gaussian_filter s={sigma}", lambda m, a, s=sigma, k=kind: m.gaussian_filter(a, s, **k)))
+            cases.append(
+                (
+                    f"gaussian_gradient_magnitude s={sigma}",
+                    lambda m, a, s=sigma, k=kind: m.gaussian_gradient_magnitude(a, s, **k),
+                )
+            )
+        cases.append(("sobel, three axes, magnitude", sobel))
+        for name, case in cases:
+            want, got = case(scipy.ndimage, small), cupy.asnumpy(case(filters, cupy.asarray(small)))
+            note = "" if np.allclose(want, got, rtol=1e-4, atol=1e-3) else "differs from SciPy"
+            # From f32: CuPy would make results of the integers' type.
+            yield f"CuPy {name}", dtype, timed(cupy, lambda: cupy.copyto(out, case(filters, f))), note
+
+
 def rows_of_torch(cupy):
     try:
         import torch
@@ -126,6 +163,8 @@ def main():
         print(f"{name:<60} {ms:8.3f}")
     for name, dtype, radius, ms, note in rows_of_cupy(cupy, filters):
         print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
+    for name, dtype, ms, note in smooth_rows(cupy, filters):
+        print(f"{name:<44} {dtype:<8} {ms:8.3f}  {note}")
     for name, dtype, radius, ms, note in rows_of_torch(cupy):
         print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
 

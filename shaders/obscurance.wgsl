@@ -34,13 +34,13 @@ struct Lines {
     forward: u32,    // contributions toward growing planes, `reach` + 1 of them, the last where nothing occludes
     backward: u32,   // toward falling planes; 0xffffffff: a sense that is not swept
     packing: u32,    // log2 of codes per word
-    mask: u32,       // bits of a code
     first: u32,      // line of thread 0
     threads: u32,
     fresh: u32,      // 1: the sums start here
     spare_0: u32,
     spare_1: u32,
     spare_2: u32,
+    spare_3: u32,
 }
 
 @group(0) @binding(0) var<uniform> p: Lines;
@@ -53,8 +53,7 @@ const NOT_SWEPT: u32 = 0xffffffffu;
 
 fn code(plane: u32, at: vec2<i32>) -> u32 {
     let index = p.code_at + plane * p.code_a + u32(at.x) * p.code_b + u32(at.y) * p.code_c;
-    let slot = index & ((1u << p.packing) - 1u);
-    return (codes[index >> p.packing] >> (slot * (32u >> p.packing))) & p.mask;
+    return unpacked(codes[index >> p.packing], index, p.packing);
 }
 
 fn shift(plane: u32) -> vec2<i32> {
@@ -101,7 +100,7 @@ fn contribution(table: u32, d: u32) -> u32 {
 @compute @workgroup_size(64)
 fn sweep(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
          @builtin(local_invocation_index) local: u32) {
-    let thread = (group.y * groups.x + group.x) * 64u + local;
+    let thread = thread_of(group, groups, local);
     if thread >= p.threads {
         return;
     }

@@ -26,7 +26,7 @@ fn every_shader_is_valid() {
     let mut failures = String::new();
     for shader in Shader::ALL {
         let name = shader.name();
-        files.retain(|f| *f != format!("{name}.wgsl"));
+        files.retain(|f| !shader.files().iter().any(|s| *f == format!("{s}.wgsl")));
         match check(shader.text()) {
             Ok(names) if names == shader.entries() => {}
             Ok(names) => failures += &format!("{name}: entry points {names:?}\n"),
@@ -42,8 +42,26 @@ fn every_shader_is_valid() {
             }
         }
     }
-    assert!(files.is_empty(), "no pipeline is made of {files:?}");
+    assert!(files.is_empty(), "no shader is made of {files:?}");
     assert!(failures.is_empty(), "{failures}");
+}
+
+#[test]
+fn no_helper_is_written_twice() {
+    let mut seen = std::collections::BTreeMap::new();
+    let mut twice = Vec::new();
+    for file in Shader::ALL.iter().flat_map(|s| s.files()).collect::<std::collections::BTreeSet<_>>() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("shaders/{file}.wgsl"));
+        let text = fs::read_to_string(path).unwrap();
+        // A function from its head to the brace at the start of a line.
+        for function in text.split("\nfn ").skip(1).map(|f| f.split("\n}").next().unwrap_or_default().to_string()) {
+            let body = function.split_once('{').map_or("", |(_, body)| body).trim().to_string();
+            if let Some(other) = seen.insert(body, *file) {
+                twice.push(format!("{file} and {other}: {}", function.lines().next().unwrap_or_default()));
+            }
+        }
+    }
+    assert!(twice.is_empty(), "{twice:?}");
 }
 
 #[test]

@@ -40,14 +40,14 @@ pub const MOMENTS4: &str = "no GPU kernel for method \"moments4\", whose guarant
 pub const SLOTS: u64 = 3;
 
 impl GpuFacts {
-    /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to seven buffers' worth
+    /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to nine buffers' worth
     /// per slot) and a dispatch stays short. Larger boxes are cut.
     pub fn buffer_cap(&self, memory: u64) -> u64 {
         self.most_bytes.min((memory / 48).clamp(256 << 10, 256 << 20))
     }
 }
 
-/// Whether windows of this type have a GPU kernel, or why not.
+/// Whether windows of this type have a GPU kernel, or why not. Of f32 they also ask for [`GpuFacts::exact_floats`].
 pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result<(), &'static str> {
     if channels.iter().any(|c| matches!(c, WindowChannel::Openness(Method::Exact, _))) {
         return Err(EXACT);
@@ -67,7 +67,7 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
         }
         DType::U8 | DType::I8 | DType::U16 | DType::I16 => Ok(()),
         DType::U32 | DType::I32 => Err("no GPU kernel that sums 32-bit integers exactly: runs on the CPU"),
-        DType::F32 => Err("no GPU kernel that holds SPEC 5.6 for f32: runs on the CPU"),
+        DType::F32 => Ok(()),
         DType::F64 => Err("no GPU kernel that holds SPEC 5.6 for f64: runs on the CPU"),
     }
 }
@@ -76,9 +76,8 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
 pub const INEXACT: &str = "the adapter rounds or fuses f32 operations unlike the CPU: runs on the CPU";
 
 /// Whether a Gaussian of this type has a GPU kernel, or why not. It also asks for [`GpuFacts::exact_floats`].
-pub fn gaussian(dtype: DType, missing: bool, variance: bool) -> Result<(), &'static str> {
+pub fn gaussian(dtype: DType, missing: bool) -> Result<(), &'static str> {
     match dtype {
-        _ if variance => Err("no GPU kernel for a Gaussian variance, which takes f64: runs on the CPU"),
         DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
             Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
         }
@@ -91,9 +90,48 @@ pub fn gaussian(dtype: DType, missing: bool, variance: bool) -> Result<(), &'sta
     }
 }
 
-/// Why gradients stay on the CPU.
-pub const GRADIENT: &str =
-    "no GPU kernel for gradients, which the CPU sums in f64 faster than results come back: runs on the CPU";
+/// Why the normals of a sweep stay on the CPU.
+pub const NORMALS: &str =
+    "normals of a sweep come from gradients in f64, since a gradient that vanishes decides there: runs on the CPU";
+
+/// Whether gradients of this type have a GPU kernel, or why not. `normals`: a sweep weighs its directions by them.
+pub fn gradient(dtype: DType, normals: bool) -> Result<(), &'static str> {
+    match dtype {
+        _ if normals => Err(NORMALS),
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 | DType::F32 => Ok(()),
+        DType::U32 | DType::I32 | DType::F64 => Err("no GPU kernel for a gradient in f64: runs on the CPU"),
+    }
+}
+
+/// Whether the chain of an occlusion map over voxels of this type has a GPU kernel, or why not. It also asks for
+/// [`GpuFacts::exact_floats`].
+pub fn occlusion_map(dtype: DType, missing: bool) -> Result<(), &'static str> {
+    match dtype {
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 if missing => {
+            Err("no GPU kernel for voxels that may be missing (nodata): runs on the CPU")
+        }
+        DType::U8 | DType::I8 | DType::U16 | DType::I16 => Ok(()),
+        _ => Err("no GPU kernel for an occlusion map of 32-bit integers or floats: runs on the CPU"),
+    }
+}
+
+/// Why an occlusion map stays on the CPU where a cell of its last level sees too many voxels.
+pub const MAP_TOO_LARGE: &str = "a cell of the occlusion map does not fit the GPU's buffers: runs on the CPU";
+
+/// How far floats of the GPU may be from the CPU's. What is not here is the same bit for bit.
+pub mod tolerance {
+    /// Components and magnitudes of gradients, times the range of the window's values over the (least) spacing. The sums of
+    /// up to 27 products in f32: 27 * 2^-24 at worst, of weights that together are less than the inverse of the spacing.
+    pub const GRADIENT: f64 = 2e-6;
+
+    /// Means of windows of f32, and of cells of occlusion maps, times the range of the window's values: merges of pairs round a step toward another mean to
+    /// f32, at most half of the distance. The second moment E\[v^2\] has this times its largest magnitude.
+    pub const MEAN: f64 = 1e-6;
+    /// Variances of windows of f32, of Gaussians and of cells of occlusion maps, relative (SPEC 5.2).
+    pub const VARIANCE: f64 = 1e-5;
+    /// Openness (SPEC 5.6).
+    pub const OPENNESS: f64 = 1e-5;
+}
 
 /// Whether obscurance of this type has a GPU kernel, or why not. `plain`: openness alone, with weights that depend on the
 /// direction only.

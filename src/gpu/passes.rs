@@ -1,9 +1,11 @@
 //! Windows: how a call is cut into parts that fit the device, and the three passes of each quantity. Pure arithmetic,
 //! shared by planner and engine.
 
+use super::finish::Channels;
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Shape};
 use crate::kernel::window::Needs;
+use crate::stage::{WindowChannel, WindowParams};
 
 /// What one dispatch does; the shaders' `struct Pass`, which explains the fields.
 #[repr(C)]
@@ -23,11 +25,14 @@ pub struct Pass {
     pub blocks: u32,
     pub block: u32,
     pub along: u32,
-    pub shift: u32,
+    pub packing: u32,
     pub flip: u32,
     pub square: u32,
     pub threads: u32,
-    pub spare: [u32; 2],
+    pub phase: u32,
+    pub zero: u32,
+    pub cell: u32,
+    pub spare: [u32; 3],
 }
 
 /// A quantity that the device makes for every window.
@@ -39,14 +44,21 @@ pub enum Quantity {
         square: bool,
         wide: bool,
     },
+    /// Least and greatest f32, as codes in their order.
+    Order,
+    /// Voxels and mean of f32; with `square` M2, too.
+    Moments {
+        square: bool,
+    },
 }
 
 impl Quantity {
     /// Bytes per window.
     pub fn bytes(self) -> u64 {
         match self {
-            Quantity::Sum { wide: true, .. } => 8,
-            _ => 4,
+            Quantity::Sum { wide: true, .. } | Quantity::Order => 8,
+            Quantity::Moments { square } => 4 * cell(square) as u64,
+            Quantity::Sum { wide: false, .. } | Quantity::Extremes => 4,
         }
     }
 }
@@ -59,11 +71,22 @@ pub struct Job {
     pub at: [usize; 3],
     /// At most the extent of `src` less one: a larger radius changes no window.
     pub radius: [usize; 3],
-    /// Bytes of a voxel: 1 or 2.
+    /// First output voxel in the volume. Floats are merged in blocks that start at multiples of the window there.
+    pub place: [i64; 3],
+    /// Bytes of a voxel: 1, 2 or 4.
     pub voxel: usize,
     /// Stored as two's complement.
     pub signed: bool,
+    /// f32.
+    pub real: bool,
     pub needs: Needs,
+    /// What the device makes of moments of f32; `None`: they come back as they are.
+    pub finish: Option<Channels>,
+}
+
+/// Words of a cell of moments.
+pub fn cell(square: bool) -> usize {
+    if square { 5 } else { 3 }
 }
 
 /// A box of the outputs and the voxels that its windows see.
@@ -80,10 +103,20 @@ pub struct Part {
 impl Job {
     /// `None` if voxels of this type have no kernel here, or the windows could hold 2^31 voxels.
     pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], radius: [usize; 3], needs: Needs) -> Option<Job> {
-        let (voxel, signed) = packed(dtype)?;
+        let Stored { voxel, signed, real } = stored(dtype)?;
         let radius = std::array::from_fn(|a| radius[a].min(src[a].saturating_sub(1)));
-        let job = Job { src, dst, at, radius, voxel, signed, needs };
+        let job = Job { src, dst, at, radius, place: [0; 3], voxel, signed, real, needs, finish: None };
         (job.count() < 1 << 31).then_some(job)
+    }
+
+    /// With the first output voxel's place in the volume.
+    pub fn placed(self, place: [i64; 3]) -> Job {
+        Job { place, ..self }
+    }
+
+    /// With what the device makes of windows of f32, where these channels can be made there.
+    pub fn finished(self, params: &WindowParams, channels: &[WindowChannel]) -> Job {
+        Job { finish: Channels::of(params, channels).filter(|_| self.real), ..self }
     }
 
     /// Most voxels of a window.
@@ -93,6 +126,11 @@ impl Job {
 
     /// What the device makes, with the widths that hold it: a sum of n codes up to T fits 32 bits where n T < 2^32.
     pub fn quantities(&self) -> Vec<Quantity> {
+        if self.real {
+            // Extremes tell which windows are the CPU's, and which are constant.
+            let moments = Quantity::Moments { square: self.needs.variance };
+            return [Some(Quantity::Order), self.needs.mean.then_some(moments)].into_iter().flatten().collect();
+        }
         let top = (1u128 << (8 * self.voxel)) - 1;
         let wide = |most: u128| self.count() as u128 * most >= 1 << 32;
         let mut list = Vec::new();
@@ -109,7 +147,7 @@ impl Job {
         list
     }
 
-    fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
+    pub(super) fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
         Part::around(self.src, self.at, self.radius, lo, dst)
     }
 
@@ -123,13 +161,18 @@ impl Job {
         let element = quantities.iter().map(|q| q.bytes()).max().unwrap_or(4);
         let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
         let ([nz, ny, nx], [mz, my, _]) = (part.src, part.dst);
+        let b = rounded(product([mz, my, nx]) * element);
+        let raw = quantities.iter().map(|q| rounded(product(part.dst) * q.bytes())).sum::<u64>();
+        let results = self.finish.map(|f| rounded(product(part.dst) * 4 * f.count() as u64));
         Sizes {
-            params: (3 * quantities.len() as u64 * PARAMS_STRIDE).max(PARAMS_STRIDE),
+            params: (3 * quantities.len() as u64 + 1) * PARAMS_STRIDE,
             tables: 0,
             source: rounded(product([nz, ny, self.pitch(part)]) * self.voxel as u64),
             a: rounded(product([mz, ny, nx]) * element),
-            b: rounded(product([mz, my, nx]) * element),
-            read: quantities.iter().map(|q| rounded(product(part.dst) * q.bytes())).sum::<u64>().max(256),
+            b: b.max(results.unwrap_or(0)),
+            c: results.map_or(0, |_| rounded(product(part.dst) * Quantity::Order.bytes())),
+            d: 0,
+            read: results.unwrap_or(raw).max(256),
         }
     }
 
@@ -153,9 +196,17 @@ impl Job {
         let axis = |a: usize| {
             let window = 2 * self.radius[a] as u32 + 1;
             let (n, m) = (part.src[a] as u32, part.dst[a] as u32);
-            let block = if quantity == Quantity::Extremes { window } else { window.max(32) };
+            let block = if matches!(quantity, Quantity::Sum { .. }) { window.max(32) } else { window };
             let start = (self.at[a] + part.lo[a]) as i64 - self.radius[a] as i64 - part.from[a] as i64;
-            Pass { n, m, first: start as i32, window, blocks: m.div_ceil(block), block, ..Pass::default() }
+            let phase = match quantity {
+                Quantity::Moments { .. } => {
+                    let first = self.place[a] + part.lo[a] as i64 - self.radius[a] as i64;
+                    first.rem_euclid(window as i64) as u32
+                }
+                _ => 0,
+            };
+            let blocks = (m + phase).div_ceil(block);
+            Pass { n, m, first: start as i32, window, blocks, block, phase, ..Pass::default() }
         };
         let z = Pass {
             in_axis: ny * pitch,
@@ -165,9 +216,8 @@ impl Job {
             out_i: 1,
             out_j: nx,
             lines: nx,
-            shift: if self.voxel == 1 { 2 } else { 1 },
+            packing: [2, 1, 0, 0][self.voxel - 1],
             flip: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
-            square: matches!(quantity, Quantity::Sum { square: true, .. }) as u32,
             ..axis(0)
         };
         let y =
@@ -184,12 +234,22 @@ impl Job {
             ..axis(2)
         };
         debug_assert!(nz > 0 && mz > 0);
-        let threads = |p: Pass, lines: u32| Pass { threads: p.blocks * p.lines * lines, ..p };
-        [threads(z, ny), threads(y, mz), threads(x, mz)]
+        let (square, words) = match quantity {
+            Quantity::Moments { square } => (square, cell(square)),
+            Quantity::Sum { square, .. } => (square, 0),
+            _ => (false, 0),
+        };
+        let shared = |p: Pass, lines: u32| {
+            let threads = p.blocks * p.lines * lines;
+            Pass { threads, square: square as u32, cell: words as u32, ..p }
+        };
+        [shared(z, ny), shared(y, mz), shared(x, mz)]
     }
 
-    /// Every quantity of a part: three passes, then what comes back, one quantity after the other.
+    /// Every quantity of a part: three passes, then what comes back, one quantity after the other; or what the device makes
+    /// of all of them.
     pub fn record(&self, part: &Part) -> Recording {
+        use Buffer::{A, B, C, Source};
         let mut commands = Vec::new();
         let mut to = 0;
         for quantity in self.quantities() {
@@ -197,17 +257,26 @@ impl Job {
                 Quantity::Extremes => Shader::Extremes,
                 Quantity::Sum { wide: false, .. } => Shader::Sums32,
                 Quantity::Sum { wide: true, .. } => Shader::Sums64,
+                Quantity::Order => Shader::Order,
+                Quantity::Moments { .. } => Shader::Moments,
             };
+            let last = if self.finish.is_some() && quantity == Quantity::Order { C } else { A };
             for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
-                use Buffer::{A, B, Source};
-                let bind = [[Source, A], [A, B], [B, A]][axis].to_vec();
+                let bind = [[Source, A], [A, B], [B, last]][axis].to_vec();
                 let params = bytemuck::bytes_of(&pass).to_vec();
                 let entry = (axis > 0) as usize;
                 commands.push(Command::Dispatch(Dispatch { shader, entry, params, bind, threads: pass.threads }));
             }
-            let bytes = result_bytes(part, quantity);
-            commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to }));
-            to += bytes.next_multiple_of(256);
+            if self.finish.is_none() {
+                let bytes = result_bytes(part, quantity);
+                commands.push(Command::Readback(Readback { from: A, bytes, to }));
+                to += bytes.next_multiple_of(256);
+            }
+        }
+        if let Some(channels) = &self.finish {
+            let cell = if self.needs.mean { cell(self.needs.variance) } else { 0 };
+            commands.push(Command::Dispatch(channels.dispatch(self, part, cell)));
+            commands.push(Command::Readback(Readback { from: B, bytes: channels.bytes(part), to: 0 }));
         }
         Recording { sizes: self.sizes(part), tables: Vec::new(), commands }
     }
@@ -231,6 +300,25 @@ pub fn packed(dtype: DType) -> Option<(usize, bool)> {
         DType::U16 => Some((2, false)),
         DType::I16 => Some((2, true)),
         _ => None,
+    }
+}
+
+/// How voxels are uploaded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stored {
+    /// Bytes: 1, 2 or 4.
+    pub voxel: usize,
+    /// Two's complement.
+    pub signed: bool,
+    /// f32.
+    pub real: bool,
+}
+
+/// As [`packed`], with f32.
+pub fn stored(dtype: DType) -> Option<Stored> {
+    match dtype {
+        DType::F32 => Some(Stored { voxel: 4, signed: false, real: true }),
+        _ => packed(dtype).map(|(voxel, signed)| Stored { voxel, signed, real: false }),
     }
 }
 
@@ -301,8 +389,22 @@ mod tests {
         let needs = Needs { extremes: false, mean: true, variance: true, float: false };
         let far = Job::new(DType::U16, [60; 3], [60; 3], [0; 3], [60; 3], needs).unwrap();
         assert_eq!(far.quantities().iter().map(|q| q.bytes()).collect::<Vec<_>>(), [8, 8]);
-        assert!(Job::new(DType::F32, [60; 3], [60; 3], [0; 3], [60; 3], needs).is_none());
+        assert!(Job::new(DType::F64, [60; 3], [60; 3], [0; 3], [60; 3], needs).is_none());
         assert!(Job::new(DType::U8, [1300; 3], [9; 3], [0; 3], [2000; 3], needs).is_none());
+    }
+
+    #[test]
+    fn floats_are_merged_in_blocks_of_the_volume() {
+        let job = job(DType::F32, 4).placed([-3, 17, 100]);
+        for part in job.parts(40_000).unwrap() {
+            let recording = job.record(&part);
+            assert_eq!(recording.fault(), None);
+            for (a, pass) in job.passes(&part, Quantity::Moments { square: true }).iter().enumerate() {
+                let first = job.place[a] + part.lo[a] as i64 - 4 - pass.phase as i64;
+                assert!(pass.phase < 9 && first.rem_euclid(9) == 0);
+                assert!(pass.blocks * 9 >= pass.m + pass.phase && (pass.blocks - 1) * 9 < pass.m + pass.phase);
+            }
+        }
     }
 
     #[test]

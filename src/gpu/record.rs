@@ -1,64 +1,14 @@
 //! What the device does with one part of a brick, as data: buffers, dispatches and what comes back. Recording asks for no
 //! device, so that tests can look at it without one.
 
+pub use super::shaders::Shader;
+
 /// Bytes between the parameters of dispatches in their buffer (the largest alignment that an adapter may ask for).
 pub const PARAMS_STRIDE: u64 = 256;
 /// Room for time stamps behind the results.
 pub const STAMP_BYTES: u64 = 256;
 /// Threads of a workgroup; in every shader.
 pub const GROUP: u32 = 64;
-
-/// The shaders, each with its text and entry points.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Shader {
-    Extremes,
-    Sums32,
-    Sums64,
-    Obscurance,
-    Gaussian,
-}
-
-impl Shader {
-    pub const ALL: [Shader; 5] =
-        [Shader::Extremes, Shader::Sums32, Shader::Sums64, Shader::Obscurance, Shader::Gaussian];
-
-    /// Name of its file under `shaders/`, without the ending.
-    pub fn name(self) -> &'static str {
-        match self {
-            Shader::Extremes => "window_extremes",
-            Shader::Sums32 => "window_sums32",
-            Shader::Sums64 => "window_sums64",
-            Shader::Obscurance => "obscurance",
-            Shader::Gaussian => "gaussian",
-        }
-    }
-
-    pub fn text(self) -> &'static str {
-        match self {
-            Shader::Extremes => include_str!("../../shaders/window_extremes.wgsl"),
-            Shader::Sums32 => include_str!("../../shaders/window_sums32.wgsl"),
-            Shader::Sums64 => include_str!("../../shaders/window_sums64.wgsl"),
-            Shader::Obscurance => include_str!("../../shaders/obscurance.wgsl"),
-            Shader::Gaussian => include_str!("../../shaders/gaussian.wgsl"),
-        }
-    }
-
-    pub fn entries(self) -> &'static [&'static str] {
-        match self {
-            Shader::Obscurance => &["sweep"],
-            _ => &["first", "next"],
-        }
-    }
-
-    /// Storage bindings after the uniform one: read, written, read, written, as many of them as the shader has.
-    pub fn bindings(self) -> usize {
-        match self {
-            Shader::Obscurance => 4,
-            Shader::Gaussian => 3,
-            _ => 2,
-        }
-    }
-}
 
 /// Device buffers of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -69,6 +19,9 @@ pub enum Buffer {
     Tables,
     A,
     B,
+    C,
+    /// Results of a first step that a second one reads.
+    D,
 }
 
 /// One dispatch.
@@ -158,6 +111,8 @@ pub struct Sizes {
     pub source: u64,
     pub a: u64,
     pub b: u64,
+    pub c: u64,
+    pub d: u64,
     /// Everything that comes back.
     pub read: u64,
 }
@@ -175,6 +130,8 @@ impl Sizes {
             source: self.source.max(o.source),
             a: self.a.max(o.a),
             b: self.b.max(o.b),
+            c: self.c.max(o.c),
+            d: self.d.max(o.d),
             read: self.read.max(o.read),
         }
     }
@@ -185,11 +142,13 @@ impl Sizes {
             Buffer::Tables => self.tables,
             Buffer::A => self.a,
             Buffer::B => self.b,
+            Buffer::C => self.c,
+            Buffer::D => self.d,
         }
     }
 
     pub fn largest(self) -> u64 {
-        self.params.max(self.tables).max(self.source).max(self.a).max(self.b).max(self.read)
+        self.params.max(self.tables).max(self.source).max(self.a).max(self.b).max(self.c).max(self.d).max(self.read)
     }
 
     /// Bytes of the upload buffer: parameters, tables, then voxels.
@@ -199,7 +158,7 @@ impl Sizes {
 
     /// Bytes of host memory that a slot takes: staging, and on a software adapter everything.
     pub fn host_bytes(self, software: bool) -> u64 {
-        let device = if software { self.upload() + self.a + self.b } else { 0 };
+        let device = if software { self.upload() + self.a + self.b + self.c + self.d } else { 0 };
         self.upload() + self.read + STAMP_BYTES + device
     }
 }
@@ -225,7 +184,7 @@ mod tests {
 
     #[test]
     fn faults_are_seen() {
-        let sizes = Sizes { params: 256, tables: 256, source: 256, a: 512, b: 256, read: 512 };
+        let sizes = Sizes { params: 256, tables: 256, source: 256, a: 512, b: 256, c: 0, d: 0, read: 512 };
         let dispatch = |bind: &[Buffer]| {
             let (shader, params) = (Shader::Sums32, vec![0; 80]);
             Command::Dispatch(Dispatch { shader, entry: 0, params, bind: bind.to_vec(), threads: 1 })

@@ -12,6 +12,8 @@ pub struct Slot {
     pub source: Held,
     pub a: Held,
     pub b: Held,
+    pub c: Held,
+    pub d: Held,
     /// Device to host: results, then time stamps.
     pub read: Held,
 }
@@ -48,6 +50,8 @@ impl Slot {
         self.source.grow(device, "source", sizes.source, U::STORAGE | U::COPY_DST);
         self.a.grow(device, "a", sizes.a, U::STORAGE | U::COPY_SRC);
         self.b.grow(device, "b", sizes.b, U::STORAGE | U::COPY_SRC);
+        self.c.grow(device, "c", sizes.c, U::STORAGE | U::COPY_SRC);
+        self.d.grow(device, "d", sizes.d, U::STORAGE | U::COPY_SRC);
         self.read.grow(device, "read", sizes.read + STAMP_BYTES, U::MAP_READ | U::COPY_DST);
     }
 
@@ -57,6 +61,8 @@ impl Slot {
             Buffer::Tables => self.tables.get(),
             Buffer::A => self.a.get(),
             Buffer::B => self.b.get(),
+            Buffer::C => self.c.get(),
+            Buffer::D => self.d.get(),
         }
     }
 

@@ -27,11 +27,10 @@ pub struct Lines {
     pub shifts: u32,
     pub tables: [u32; 2],
     pub packing: u32,
-    pub mask: u32,
     pub first: u32,
     pub threads: u32,
     pub fresh: u32,
-    pub spare: [u32; 3],
+    pub spare: [u32; 4],
 }
 
 /// One call: openness on `dst` of voxels that cover `src`, both in global indices.
@@ -109,6 +108,8 @@ impl<'a> SweepJob<'a> {
             source: rounded((nz * ny * part.pitch(self.code) * self.code) as u64),
             a: rounded(voxels * 4),
             b: rounded(links),
+            c: 0,
+            d: 0,
             read: rounded(voxels * 4),
         })
     }
@@ -184,7 +185,6 @@ impl<'a> SweepJob<'a> {
             shifts,
             tables: starts,
             packing: [2, 1, 0, 0][self.code - 1],
-            mask: u32::MAX >> (32 - 8 * self.code),
             ..Lines::default()
         }
     }

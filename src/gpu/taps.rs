@@ -1,5 +1,5 @@
-//! Gaussian means: how a brick is cut into parts that fit the device, the table of weights, and one pass per axis. Pure
-//! arithmetic, shared by planner and engine.
+//! Gaussian means and variances: how a brick is cut into parts that fit the device, the table of weights, and one pass per
+//! axis of each. Pure arithmetic, shared by planner and engine.
 
 use super::passes::{Part, cut, packed};
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
@@ -25,7 +25,9 @@ pub struct Taps {
     pub sign: u32,
     pub zero: u32,
     pub threads: u32,
-    pub spare: u32,
+    pub centres: u32,
+    pub last: u32,
+    pub spare: [u32; 3],
 }
 
 /// One call, all extents `[z, y, x]`.
@@ -39,16 +41,35 @@ pub struct TapsJob {
     /// Bytes of a voxel: 1 or 2.
     pub voxel: usize,
     signed: bool,
+    pub moments: Wanted,
 }
+
+/// What is made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Wanted {
+    pub mean: bool,
+    pub variance: bool,
+}
+
+/// A moment and the shader that makes it.
+const MEAN: Shader = Shader::Gaussian;
+const VARIANCE: Shader = Shader::GaussianVariance;
 
 impl TapsJob {
     /// `None` if voxels of this type have no kernel here.
-    pub fn new(dtype: DType, src: Shape, dst: Shape, at: [usize; 3], sigma: [f64; 3]) -> Option<TapsJob> {
+    pub fn new(
+        dtype: DType,
+        src: Shape,
+        dst: Shape,
+        at: [usize; 3],
+        sigma: [f64; 3],
+        moments: Wanted,
+    ) -> Option<TapsJob> {
         let (voxel, signed) = packed(dtype)?;
-        Some(TapsJob { src, dst, at, sigma, radius: gaussian::shared::radius(sigma, src), voxel, signed })
+        Some(TapsJob { src, dst, at, sigma, radius: gaussian::shared::radius(sigma, src), voxel, signed, moments })
     }
 
-    fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
+    pub(super) fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
         Part::around(self.src, self.at, self.radius, lo, dst)
     }
 
@@ -57,17 +78,22 @@ impl TapsJob {
         part.src[2].next_multiple_of(4 / self.voxel)
     }
 
-    fn sizes(&self, part: &Part) -> Sizes {
-        let words = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>() * 4;
+    pub(super) fn sizes(&self, part: &Part) -> Sizes {
+        let voxels = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
+        let words = |s: Shape| voxels(s) * if self.moments.variance { 12 } else { 4 };
+        let results = self.moments.mean as u64 + self.moments.variance as u64;
         let ([nz, ny, _], [_, my, mx]) = (part.src, part.dst);
-        let table: usize = (0..3).map(|a| part.dst[a] * self.radius[a]).sum();
+        let dispatches = 3 * results;
+        let table: usize = (0..3).map(|a| part.dst[a] * (self.radius[a] + 1)).sum();
         Sizes {
-            params: 3 * PARAMS_STRIDE,
+            params: dispatches.max(1) * PARAMS_STRIDE,
             tables: rounded(table as u64 * 4),
             source: rounded((nz * ny * self.pitch(part) * self.voxel) as u64),
             a: rounded(words([nz, ny, mx])),
             b: rounded(words([nz, my, mx])),
-            read: rounded(words(part.dst)),
+            c: 0,
+            d: 0,
+            read: results.max(1) * rounded(voxels(part.dst) * 4),
         }
     }
 
@@ -83,9 +109,52 @@ impl TapsJob {
         parts.iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
     }
 
-    /// x from packed voxels, then y, then z, as the CPU does it.
+    /// Where the results of a moment stand among those that come back.
+    pub fn place(&self, part: &Part, variance: bool) -> std::ops::Range<usize> {
+        let bytes = part.dst.iter().product::<usize>() * 4;
+        let from = if variance && self.moments.mean { bytes.next_multiple_of(256) } else { 0 };
+        from..from + bytes
+    }
+
+    /// x from packed voxels, then y, then z, as the CPU does it; the mean, then the variance.
     pub fn record(&self, part: &Part) -> Recording {
         let mut recording = Recording { sizes: self.sizes(part), ..Recording::default() };
+        let starts = self.tables(part, &mut recording.tables);
+        for (shader, wanted) in [(MEAN, self.moments.mean), (VARIANCE, self.moments.variance)] {
+            if wanted {
+                self.passes(part, shader, starts, Buffer::A, &mut recording.commands);
+                let place = self.place(part, shader == VARIANCE);
+                let (bytes, to) = (place.len() as u64, place.start as u64);
+                recording.commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to }));
+            }
+        }
+        recording
+    }
+
+    /// The mean alone, left on the device in `to`.
+    pub(super) fn record_into(&self, part: &Part, to: Buffer) -> Recording {
+        let mut recording = Recording { sizes: self.sizes(part), ..Recording::default() };
+        let starts = self.tables(part, &mut recording.tables);
+        self.passes(part, MEAN, starts, to, &mut recording.commands);
+        recording
+    }
+
+    /// Weights of every axis and of its centres, for each output along it, and where they start.
+    fn tables(&self, part: &Part, tables: &mut Vec<u32>) -> [[u32; 2]; 3] {
+        std::array::from_fn(|axis| {
+            let (sigma, radius, n) = (self.sigma[axis], self.radius[axis], self.src[axis]);
+            let centres = (0..part.dst[axis]).map(|k| self.at[axis] + part.lo[axis] + k);
+            let weights = tables.len() as u32;
+            for p in centres.clone() {
+                tables.extend(gaussian::shared::weights(sigma, radius, p, n).map(f32::to_bits));
+            }
+            let start = tables.len() as u32;
+            tables.extend(centres.map(|p| gaussian::shared::centre_weight(sigma, radius, p, n).to_bits()));
+            [weights, start]
+        })
+    }
+
+    fn passes(&self, part: &Part, shader: Shader, starts: [[u32; 2]; 3], last: Buffer, commands: &mut Vec<Command>) {
         let pitch = self.pitch(part);
         let mut strides = [part.src[1] * pitch, pitch, 1];
         let mut extent = part.src;
@@ -94,16 +163,9 @@ impl TapsJob {
             let next = [extent[1] * extent[2], extent[2], 1];
             let others = [[1, 2], [0, 2], [0, 1]][axis];
             let order = |s: [usize; 3]| [s[axis] as u32, s[others[0]] as u32, s[others[1]] as u32];
-            let centre = self.at[axis] + part.lo[axis];
-            let weights = recording.tables.len() as u32;
-            for k in 0..part.dst[axis] {
-                let (radius, n) = (self.radius[axis], self.src[axis]);
-                let row = gaussian::shared::weights(self.sigma[axis], radius, centre + k, n);
-                recording.tables.extend(row.map(f32::to_bits));
-            }
             let taps = Taps {
                 n: self.src[axis] as u32,
-                at: centre as u32,
+                at: (self.at[axis] + part.lo[axis]) as u32,
                 from: part.from[axis] as u32,
                 m: part.dst[axis] as u32,
                 radius: self.radius[axis] as u32,
@@ -112,15 +174,17 @@ impl TapsJob {
                 inner: extent[2] as u32,
                 middle: extent[1] as u32,
                 axis: axis as u32,
-                weights,
+                weights: starts[axis][0],
                 packing: if self.voxel == 1 { 2 } else { 1 },
                 sign: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
                 threads: extent.iter().product::<usize>() as u32,
+                centres: starts[axis][1],
+                last: (axis == 0) as u32,
                 ..Taps::default()
             };
-            let [input, output] = [[Buffer::B, Buffer::A], [Buffer::A, Buffer::B], [Buffer::Source, Buffer::A]][axis];
-            recording.commands.push(Command::Dispatch(Dispatch {
-                shader: Shader::Gaussian,
+            let [input, output] = [[Buffer::B, last], [Buffer::A, Buffer::B], [Buffer::Source, Buffer::A]][axis];
+            commands.push(Command::Dispatch(Dispatch {
+                shader,
                 entry,
                 params: bytemuck::bytes_of(&taps).to_vec(),
                 bind: vec![input, output, Buffer::Tables],
@@ -128,9 +192,6 @@ impl TapsJob {
             }));
             strides = next;
         }
-        let bytes = part.dst.iter().product::<usize>() as u64 * 4;
-        recording.commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to: 0 }));
-        recording
     }
 }
 
@@ -142,19 +203,23 @@ mod tests {
     fn recordings_are_sound_and_parts_tile_the_outputs() {
         // The widest kernel sees the whole source from every voxel.
         for (sigma, least) in [([0.4; 3], 30_000), ([2.0, 0.7, 3.3], 90_000), ([40.0; 3], 150_000)] {
-            let job = TapsJob::new(DType::I16, [40, 30, 50], [20, 30, 40], [10, 0, 5], sigma).unwrap();
-            for cap in [1 << 30, least] {
-                let parts = job.parts(cap).unwrap();
-                assert_eq!(parts.iter().map(|p| p.dst.iter().product::<usize>()).sum::<usize>(), 20 * 30 * 40);
-                for part in &parts {
-                    let recording = job.record(part);
-                    assert_eq!(recording.fault(), None);
-                    assert!(recording.sizes.largest() <= cap);
-                    assert_eq!(recording.dispatches().count(), 3);
+            for (mean, variance) in [(true, false), (false, true), (true, true)] {
+                let moments = Wanted { mean, variance };
+                let job = TapsJob::new(DType::I16, [40, 30, 50], [20, 30, 40], [10, 0, 5], sigma, moments).unwrap();
+                for cap in [1 << 30, 3 * least] {
+                    let parts = job.parts(cap).unwrap();
+                    assert_eq!(parts.iter().map(|p| p.dst.iter().product::<usize>()).sum::<usize>(), 20 * 30 * 40);
+                    for part in &parts {
+                        let recording = job.record(part);
+                        assert_eq!(recording.fault(), None);
+                        assert!(recording.sizes.largest() <= cap);
+                        assert_eq!(recording.dispatches().count(), 3 * (mean as usize + variance as usize));
+                    }
                 }
+                assert!(job.parts(300).is_none());
             }
-            assert!(job.parts(300).is_none());
         }
-        assert!(TapsJob::new(DType::F32, [4; 3], [4; 3], [0; 3], [1.0; 3]).is_none());
+        let moments = Wanted { mean: true, variance: true };
+        assert!(TapsJob::new(DType::F32, [4; 3], [4; 3], [0; 3], [1.0; 3], moments).is_none());
     }
 }

@@ -1,18 +1,21 @@
-//! Box statistics and estimators on the device: exact sums and extremes there, the CPU's row functions here.
+//! Box statistics and estimators on the device: exact sums and extremes, or moments of f32, there; the CPU's row functions
+//! here.
 
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::facts;
+use super::float_windows;
 use super::passes::{Job, Part, Quantity, result_bytes};
-use crate::grid::{AnyView, View, Voxel};
+use crate::grid::{AnyView, DType, View, Voxel};
 use crate::kernel::Context;
 use crate::kernel::window::finish::{Sums, Windows, finish};
-use crate::kernel::window::{self, Needs, WindowOut};
+use crate::kernel::window::{self, Needs, Place, WindowOut};
 use crate::stage::WindowParams;
 
 impl Gpu {
-    /// The same as [`window::window`], bit for bit, for inputs that [`facts::window`] admits. Windows too large for the
-    /// device even one voxel at a time are computed by the CPU kernel. After a failure the device is opened anew and the
-    /// call tried once more.
+    /// The same as [`window::window`] for inputs that [`facts::window`] admits: of integers bit for bit, of f32 within
+    /// [`facts::tolerance`], on an adapter with exact floats. `voxel` is the first output voxel's place in the volume.
+    /// Windows too large for the device even one voxel at a time are computed by the CPU kernel. After a failure the device
+    /// is opened anew and the call tried once more.
     ///
     /// Panics where [`window::window`] does.
     ///
@@ -23,20 +26,27 @@ impl Gpu {
         src: AnyView,
         params: &WindowParams,
         at: [usize; 3],
+        voxel: [i64; 3],
         outs: &mut [WindowOut],
         cx: &mut Context,
     ) -> Result<Times, GpuError> {
         let channels: Vec<_> = outs.iter().map(|o| o.channel).collect();
-        facts::window(src.dtype(), params.missing.is_some(), &channels).map_err(|e| GpuError(e.into()))?;
+        let missing = params.missing.is_some() && !src.dtype().is_float();
+        facts::window(src.dtype(), missing, &channels).map_err(|e| GpuError(e.into()))?;
         let Some(dst) = outs.first().map(|o| o.dst.shape()) else { return Ok(Times::default()) };
         assert!((0..3).all(|a| at[a] + dst[a] <= src.shape()[a]), "output {dst:?} at {at:?} sticks out");
         if dst.contains(&0) {
             return Ok(Times::default());
         }
-        let needs = Needs::of(channels.into_iter(), false);
-        let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs);
+        let needs = Needs::of(channels.iter().copied(), src.dtype().is_float());
+        let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs).map(|j| {
+            // The shader writes f32.
+            let wide = outs.iter().any(|o| o.dst.dtype() != DType::F32);
+            if wide { j.placed(voxel) } else { j.placed(voxel).finished(params, &channels) }
+        });
         let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap())?))) else {
-            window::window(src, params, window::Place::whole(at), outs, cx); // integers are exact
+            // Integers are exact, and that a window of floats is too large depends on its radius and the volume alone.
+            window::window(src, params, Place::new(at, voxel), outs, cx);
             return Ok(Times::default());
         };
         self.attempt(|device| {
@@ -45,7 +55,11 @@ impl Gpu {
                 let recording = job.record(part);
                 let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, part, job.pitch(part) * job.voxel, out);
                 let mut done = |bytes: Option<&[u8]>| {
-                    let windows = windows(bytes.unwrap_or_default(), part, &job.quantities())?;
+                    let bytes = bytes.unwrap_or_default();
+                    if let AnyView::F32(v) = src {
+                        return float_windows::finish(&job, part, bytes, v, params, outs, cx);
+                    }
+                    let windows = windows(bytes, part, &job.quantities())?;
                     finish(src, params, job.at, outs, &windows, cx);
                     Ok(())
                 };
@@ -74,16 +88,19 @@ pub(super) fn pack(src: AnyView, part: &Part, pitch: usize, out: &mut wgpu::Writ
         AnyView::I8(v) => write(v, part, pitch, out),
         AnyView::U16(v) => write(v, part, pitch, out),
         AnyView::I16(v) => write(v, part, pitch, out),
+        AnyView::F32(v) => write(v, part, pitch, out),
         other => unreachable!("no job is made of {}", other.dtype()),
     }
     true
 }
 
+/// Mapped bytes as what the device wrote.
+pub(super) fn cast<T: bytemuck::Pod>(bytes: &[u8]) -> Result<&[T], GpuError> {
+    bytemuck::try_cast_slice(bytes).map_err(|e| GpuError(format!("results are not aligned: {e}")))
+}
+
 /// The mapped results of a part by quantity.
 fn windows<'a>(bytes: &'a [u8], part: &Part, quantities: &[Quantity]) -> Result<Windows<'a>, GpuError> {
-    fn cast<T: bytemuck::Pod>(bytes: &[u8]) -> Result<&[T], GpuError> {
-        bytemuck::try_cast_slice(bytes).map_err(|e| GpuError(format!("results are not aligned: {e}")))
-    }
     let mut out = Windows { lo: part.lo, shape: part.dst, extremes: &[], s1: Sums::None, s2: Sums::None };
     let mut place = 0;
     for &quantity in quantities {
@@ -95,6 +112,7 @@ fn windows<'a>(bytes: &'a [u8], part: &Part, quantities: &[Quantity]) -> Result<
                 let sums = if wide { Sums::Wide(cast(slice)?) } else { Sums::Narrow(cast(slice)?) };
                 *(if square { &mut out.s2 } else { &mut out.s1 }) = sums;
             }
+            Quantity::Order | Quantity::Moments { .. } => unreachable!("integers have sums"),
         }
         place += len.next_multiple_of(256);
     }

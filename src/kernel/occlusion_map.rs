@@ -146,6 +146,11 @@ fn six_weights(i: i64, n: i64, valid: [bool; 6]) -> [f64; 6] {
     std::array::from_fn(|k| if found > 0.0 { (blurred[0][k] + blurred[1][k]) / found } else { 0.0 })
 }
 
+/// Weights of the six finer cells in coarse cell `i` of an axis of `n` fine cells, all of them valid.
+pub fn full_weights(i: i64, n: i64) -> [f64; 6] {
+    six_weights(i, n, [true; 6])
+}
+
 impl Steps {
     /// Cell `i` of the coarse box along `axis`, as a global index.
     fn global(&self, axis: usize, i: usize) -> i64 {

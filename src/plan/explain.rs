@@ -42,12 +42,18 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
         let (_, device, reason) = &plan.placement[s];
         let _ = writeln!(w, "step {s}: {} -> {} on {device} ({reason})", reads(plan, step), makes(plan, step));
         let _ = writeln!(w, "  {}, reach {:?}, halo beyond the brick {:?}", step.kind.name(), step.reach, step.halo);
+        if let Some(reader) = plan.chains[s] {
+            let _ = writeln!(w, "  its results stay on the GPU for step {reader}");
+        }
         if plan.shares(s) {
             let _ = writeln!(w, "  CPU workers take bricks too while the GPU's slots are taken");
         }
         if step.stages.len() > 1 {
             let _ = writeln!(w, "  one pass for {}", step.stages.join(", "));
         }
+    }
+    for (_, device, reason) in (0..plan.outputs.len()).filter_map(|o| plan.map_placement(o)) {
+        let _ = writeln!(w, "occlusion map on {device} ({reason})");
     }
     for (group, known) in plan.groups.iter().zip(skips) {
         group_text(w, plan, group);
@@ -189,10 +195,12 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         .steps
         .iter()
         .zip(&plan.placement)
-        .map(|(step, (_, device, reason))| {
+        .zip(&plan.chains)
+        .map(|((step, (_, device, reason)), chain)| {
             json!({
                 "stages": step.stages, "kernel": step.kind.name(), "reads": reads(plan, step), "makes": makes(plan, step),
                 "reach": step.reach, "halo": step.halo, "device": device, "reason": reason,
+                "stays_on_gpu_for_step": chain,
             })
         })
         .collect();

@@ -1,9 +1,9 @@
 //! Bytes by formula: what one brick of a given shape keeps alive at its worst moment, and what the run keeps besides.
 
-use super::graph::{Step, StepKind, WireId};
+use super::graph::{GradientChannel, Moment, Step, StepId, StepKind, WireId};
 use super::tasks::{Group, input_halo};
-use super::{OutputPlan, Plan};
-use crate::gpu::{facts, passes, record, sweep, taps};
+use super::{OutputPlan, Plan, chains};
+use crate::gpu::{facts, passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, levels, moments4, obscurance, rank, reduce, window};
 
@@ -30,9 +30,16 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
         group.inputs.iter().map(|&w| (w, wire_bytes(w, input_halo(plan, group, w)))).collect();
     let mut peak = sum(&live);
     for (at, &s) in group.steps.iter().enumerate() {
-        let step = &plan.graph.steps[s];
-        let outputs: Vec<(WireId, u64)> = step.outputs.iter().map(|&w| (w, wire_bytes(w, step.halo))).collect();
+        let of = |s: StepId| {
+            let step = &plan.graph.steps[s];
+            step.outputs.iter().map(|&w| (w, wire_bytes(w, step.halo))).collect::<Vec<(WireId, u64)>>()
+        };
+        let outputs = of(s);
         peak = peak.max(sum(&live) + sum(&outputs));
+        if let Some(reader) = plan.chains[s] {
+            // Its reader's results are made with it, unless the two must run one by one.
+            peak = peak.max(sum(&live) + sum(&of(reader)));
+        }
         live.extend(outputs);
         let last_use = |w: WireId| {
             group.sinks.contains(&w) || group.steps[at + 1..].iter().any(|&t| reads(&plan.graph.steps[t], w))
@@ -47,7 +54,11 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
 
 /// Bytes that a worker needs besides to compute bricks of `shape`: bricks that wait to be computed or written take none.
 pub fn scratch_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
-    let steps = group.steps.iter().map(|&s| step_scratch(plan, &plan.graph.steps[s], shape, group.shape));
+    let steps = group.steps.iter().map(|&s| {
+        let step = &plan.graph.steps[s];
+        step_scratch(plan, step, shape, group.shape)
+            + if plan.on_gpu(s) { redone(plan, step, shape, group.shape) } else { 0 }
+    });
     steps.max().unwrap_or(0)
 }
 
@@ -95,6 +106,18 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     (kernel + copy + mask) as u64
 }
 
+/// Windows of f32 that the GPU leaves to the CPU are made in a box of their own, and rows are finished there.
+fn redone(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
+    match &step.kind {
+        StepKind::Window { channels, .. } if plan.graph.wires[step.inputs[0]].dtype.is_float() => {
+            let dst = grown(brick, step.halo, volume);
+            let rows = window::finish_floats::scratch_bytes(dst[2]);
+            (dst.iter().product::<usize>() * channels.len() * DType::F32.size() + rows) as u64
+        }
+        _ => 0,
+    }
+}
+
 /// f32 copies of three components that a sweep reads or writes.
 fn narrowed(shape: Shape, used: bool) -> usize {
     if used { shape.iter().product::<usize>() * 12 } else { 0 }
@@ -105,9 +128,28 @@ fn narrowed(shape: Shape, used: bool) -> usize {
 fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
     let Some(gpu) = &plan.gpu else { return 0 };
     let cap = gpu.buffer_cap(plan.memory);
-    let steps = group.steps.iter().filter(|&&s| plan.on_gpu(s)).map(|&s| &plan.graph.steps[s]);
-    let sizes = steps.map(|s| slot_sizes(plan, group, s, cap)).fold(record::Sizes::default(), record::Sizes::max);
-    facts::SLOTS * sizes.host_bytes(gpu.software)
+    let steps = group.steps.iter().filter(|&&s| plan.on_gpu(s));
+    let sizes = steps.map(|&s| {
+        let step = &plan.graph.steps[s];
+        let chained = plan.chains[s].map_or(record::Sizes::default(), |t| {
+            let reader = &plan.graph.steps[t];
+            let dst = grown(group.brick.shape, reader.halo, group.shape);
+            let extents = chains::extents(step, reader, dst, group.shape);
+            let job = chains::job(step, reader, plan.graph.wires[step.inputs[0]].dtype, &extents);
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        });
+        slot_sizes(plan, group, step, cap).max(chained)
+    });
+    let maps = group.outputs.iter().filter(|&&o| plan.map_on_gpu(o)).filter_map(|&o| {
+        // A brick in the middle of the map, where it sees most.
+        let job = plan.outputs[o].map_job(&plan.graph)?;
+        let shape = plan.outputs[o].region.shape();
+        let lo: [i64; 3] =
+            std::array::from_fn(|a| (shape[a].saturating_sub(group.brick.shape[a]) / 2 / 16 * 16) as i64);
+        let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + group.brick.shape[a] as i64));
+        Some(job.slot(brick.clip(&Region::whole(shape)), cap))
+    });
+    facts::SLOTS * sizes.chain(maps).fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
 }
 
 /// Largest buffers that a step needs on the GPU.
@@ -121,9 +163,9 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
     let dtype = plan.graph.wires[step.inputs[0]].dtype;
     match &step.kind {
         StepKind::Window { params, channels } => {
-            let needs = window::Needs::of(channels.iter().copied(), false);
+            let needs = window::Needs::of(channels.iter().copied(), dtype.is_float());
             let job = passes::Job::new(dtype, src, dst, at, params.radius, needs);
-            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+            job.map_or(record::Sizes::default(), |j| j.finished(params, channels).slot(cap))
         }
         StepKind::Obscurance { params, .. } => {
             let prepared = obscurance::Prepared::new(params);
@@ -132,8 +174,14 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
             let job = sweep::SweepJob::new(&prepared, dtype, Region::whole(src), inner);
             job.map_or(record::Sizes::default(), |j| j.slot(cap))
         }
-        StepKind::Gaussian { sigma, .. } => {
-            let job = taps::TapsJob::new(dtype, src, dst, at, *sigma);
+        StepKind::Gaussian { sigma, channels } => {
+            let [mean, variance] = [Moment::Mean, Moment::Variance].map(|m| channels.contains(&m));
+            let job = taps::TapsJob::new(dtype, src, dst, at, *sigma, taps::Wanted { mean, variance });
+            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        }
+        StepKind::Gradient { size, weight, spacing, channels, .. } => {
+            let fit = slopes::Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
+            let job = slopes::SlopesJob::new(dtype, src, dst, at, &fit, channels.contains(&GradientChannel::Vector));
             job.map_or(record::Sizes::default(), |j| j.slot(cap))
         }
         _ => record::Sizes::default(),

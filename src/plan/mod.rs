@@ -2,6 +2,7 @@
 //! indices, printable, without threads, buffers or files.
 
 pub mod brick;
+pub mod chains;
 pub mod explain;
 pub mod graph;
 pub mod lengths;
@@ -64,6 +65,8 @@ pub struct Plan {
     pub placement: Placement,
     /// The adapter that the steps placed on "gpu" run on.
     pub gpu: Option<GpuFacts>,
+    /// By step: the step for which its results stay on the GPU.
+    pub chains: Vec<Option<StepId>>,
 }
 
 impl Plan {
@@ -77,7 +80,7 @@ impl Plan {
             n => n,
         };
         let graph = lowered.graph;
-        let (placement, gpu) = placement(config, &graph, find_gpu)?;
+        let (placement, gpu) = placement(config, &graph, &outputs, find_gpu)?;
         let warnings = warnings(&graph);
         let mut plan = Plan {
             groups: Vec::new(),
@@ -91,11 +94,13 @@ impl Plan {
             warnings,
             placement,
             gpu,
+            chains: Vec::new(),
         };
         if plan.waives_byte_identity() {
             plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
         }
         plan.groups = tasks::groups(&plan);
+        plan.chains = chains::chains(&plan);
         for g in 0..plan.groups.len() {
             plan.groups[g].brick = brick::choose(&plan, &plan.groups[g], config)?;
         }
@@ -128,6 +133,18 @@ impl Plan {
         (config.run.device == Device::Auto).then(|| format!("device = \"auto\": running on the CPU, {why}"))
     }
 
+    /// Device and reason of the occlusion map of output `o`; they follow those of the steps.
+    pub fn map_placement(&self, o: usize) -> Option<&(String, &'static str, String)> {
+        self.outputs[o].map.as_ref()?;
+        let before = self.outputs[..o].iter().filter(|p| p.map.is_some()).count();
+        self.placement.get(self.graph.steps.len() + before)
+    }
+
+    /// Whether the occlusion map of output `o` is made on the GPU.
+    pub fn map_on_gpu(&self, o: usize) -> bool {
+        self.map_placement(o).is_some_and(|p| p.1 == "gpu")
+    }
+
     /// Whether a step was placed on the GPU.
     pub fn on_gpu(&self, step: StepId) -> bool {
         self.placement[step].1 == "gpu"
@@ -136,13 +153,13 @@ impl Plan {
     /// Whether a step on the GPU gives bricks to CPU workers while all slots are taken: where results are integers or fixed
     /// point, and with `lanes = "mixed"` everywhere.
     pub fn shares(&self, step: StepId) -> bool {
-        self.on_gpu(step) && (self.lanes == Lanes::Mixed || !floats(&self.graph.steps[step]))
+        self.on_gpu(step) && (self.lanes == Lanes::Mixed || !floats(&self.graph, &self.graph.steps[step]))
     }
 
     /// `lanes = "mixed"` with a step whose floats both lanes make.
     pub fn waives_byte_identity(&self) -> bool {
         let steps = &self.graph.steps;
-        self.lanes == Lanes::Mixed && (0..steps.len()).any(|s| self.on_gpu(s) && floats(&steps[s]))
+        self.lanes == Lanes::Mixed && (0..steps.len()).any(|s| self.on_gpu(s) && floats(&self.graph, &steps[s]))
     }
 
     /// Tasks of all groups; their numbers are dense.
@@ -159,7 +176,7 @@ impl Plan {
 /// How the reason begins where a GPU would have been used.
 const NO_GPU: &str = "no GPU: ";
 
-/// Stage, device and reason of every step.
+/// Stage, device and reason of every step, then of every output that is an occlusion map.
 pub type Placement = Vec<(String, &'static str, String)>;
 
 /// Whether a step that reads `input` has a GPU kernel, or why not.
@@ -167,7 +184,7 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     let windows = match &step.kind {
         graph::StepKind::Window { channels, .. } => Some(channels),
         graph::StepKind::Gaussian { .. } => None,
-        graph::StepKind::Gradient { .. } => return Err(facts::GRADIENT),
+        graph::StepKind::Gradient { stored, .. } => return facts::gradient(input.dtype, *stored),
         graph::StepKind::Rank { .. } => return Err(facts::EXACT),
         graph::StepKind::Obscurance { channels, normal, .. } => {
             let plain = normal.is_none() && channels[..] == [graph::ObscuranceChannel::Openness];
@@ -185,47 +202,87 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     let missing = input.missing.is_some();
     match (windows, &step.kind) {
         (Some(channels), _) => facts::window(input.dtype, missing, channels),
-        (None, graph::StepKind::Gaussian { channels, .. }) => {
-            facts::gaussian(input.dtype, missing, channels.contains(&graph::Moment::Variance))
-        }
+        (None, graph::StepKind::Gaussian { .. }) => facts::gaussian(input.dtype, missing),
         (None, _) => unreachable!("other kinds of steps have returned"),
     }
 }
 
+/// Whether a step on the GPU makes floats there.
+fn floats(graph: &Graph, step: &graph::Step) -> bool {
+    exact(graph, step) || matches!(step.kind, graph::StepKind::Gradient { .. })
+}
+
 /// Whether a step needs [`GpuFacts::exact_floats`].
-fn floats(step: &graph::Step) -> bool {
-    matches!(step.kind, graph::StepKind::Gaussian { .. })
+fn exact(graph: &Graph, step: &graph::Step) -> bool {
+    match step.kind {
+        graph::StepKind::Gaussian { .. } => true,
+        graph::StepKind::Window { .. } => graph.wires[step.inputs[0]].dtype.is_float(),
+        _ => false,
+    }
 }
 
 /// Device of every step. An adapter is looked for where one is demanded, or where `auto` has a step for it.
-fn placement(config: &Config, graph: &Graph, find: FindGpu) -> Result<(Placement, Option<GpuFacts>)> {
-    let supported = |s: &graph::Step| gpu_kernel(s, &graph.wires[s.inputs[0]]);
-    let any = graph.steps.iter().any(|s| supported(s).is_ok());
+fn placement(
+    config: &Config,
+    graph: &Graph,
+    outputs: &[OutputPlan],
+    find: FindGpu,
+) -> Result<(Placement, Option<GpuFacts>)> {
+    // Name, whether there is a kernel, whether it asks for exact floats, and an occlusion map's output.
+    let steps = graph.steps.iter().map(|s| {
+        let kernel = gpu_kernel(s, &graph.wires[s.inputs[0]]);
+        (s.stages.join("+"), kernel, exact(graph, s), None)
+    });
+    let maps = outputs.iter().filter_map(|o| o.map.as_ref().map(|m| (o, m))).map(|(o, m)| {
+        let wire = &graph.wires[m.source];
+        let kernel = facts::occlusion_map(wire.dtype, wire.missing.is_some());
+        (config.outputs[o.index].from[0].name.clone(), kernel, true, Some(o))
+    });
+    let work: Vec<_> = steps.chain(maps).collect();
+    let any = work.iter().any(|w| w.1.is_ok());
     let found = match config.run.device {
         Device::Cpu => None,
         Device::Auto => any.then(find),
-        Device::Gpu | Device::GpuSoftware => {
-            let facts = find().map_err(|why| {
-                let name = if config.run.device == Device::Gpu { "gpu" } else { "gpu:software" };
-                Error::Failed(format!(
-                    "run.device: \"{name}\" was asked for, and no such GPU can be used: {why}; use device = \"cpu\" or \"auto\""
-                ))
-            })?;
-            Some(Ok(facts))
-        }
+        Device::Gpu | Device::GpuSoftware => Some(Ok(find().map_err(|why| no_such_gpu(config, &why))?)),
     };
-    let place = |s: &graph::Step| match (&found, supported(s)) {
+    let place = |kernel: Result<(), &'static str>, exact: bool, map: Option<&OutputPlan>| match (&found, kernel) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
-        (Some(Ok(gpu)), Ok(())) if floats(s) && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if exact && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if map.is_some_and(|o| !map_fits(graph, o, gpu.buffer_cap(config.run.memory))) => {
+            ("cpu", facts::MAP_TOO_LARGE.to_string())
+        }
         (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),
     };
-    let places: Placement =
-        graph.steps.iter().map(|s| (s, place(s))).map(|(s, p)| (s.stages.join("+"), p.0, p.1)).collect();
+    let places: Placement = work
+        .into_iter()
+        .map(|(name, kernel, exact, map)| {
+            let (device, reason) = place(kernel, exact, map);
+            (name, device, reason)
+        })
+        .collect();
     let used = places.iter().any(|p| p.1 == "gpu");
     Ok((places, found.and_then(|f| f.ok()).filter(|_| used)))
+}
+
+fn map_fits(graph: &Graph, output: &OutputPlan, cap: u64) -> bool {
+    output.map_job(graph).is_some_and(|job| job.fits(cap))
+}
+
+/// A GPU that was demanded and is not there: the file and line that ask for it, what was found, what would be accepted. The
+/// config is right where there is such a GPU, so that it is the run that fails.
+fn no_such_gpu(config: &Config, why: &str) -> Error {
+    let (name, other) = match config.run.device {
+        Device::GpuSoftware => ("gpu:software", "gpu"),
+        _ => ("gpu", "gpu:software"),
+    };
+    let message = format!(
+        "\"{name}\" was asked for, and no such GPU can be used: {why}; accepted here: \"cpu\", \"auto\" (the CPU where \
+         there is no GPU) or \"{other}\" with such a driver"
+    );
+    Error::Failed(config.locate(Error::config("run.device", message)).to_string())
 }
 
 /// Windows of equal voxel radius on unequal spacing are long in space: say so.

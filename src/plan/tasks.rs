@@ -3,9 +3,11 @@
 //! A task owns whole shards of level 0 and of as many further levels as fit in about [`TASK_EDGE`] voxels per axis. It
 //! depends on shapes, chunks and shards only, never on bricks, threads or budget, so that a resumed run may change those.
 
+use super::graph::Graph;
 use super::graph::{StepId, WireId, max3};
 use super::{BrickChoice, OutputPlan, Plan};
 use crate::config::OutputFormat;
+use crate::gpu::maps::{MapJob, MapLevel};
 use crate::grid::{Region, Shape};
 use crate::store::LevelLayout;
 
@@ -100,6 +102,14 @@ impl OutputPlan {
 
     pub fn is_zarr(&self) -> bool {
         matches!(self.spec.format, OutputFormat::OmeZarr04 | OutputFormat::OmeZarr05)
+    }
+
+    /// An occlusion map's chain as the GPU records it, where it has a kernel.
+    pub fn map_job(&self, graph: &Graph) -> Option<MapJob> {
+        let map = self.map.as_ref()?;
+        let levels = map.chain.levels[..=self.brick_level()].iter();
+        let levels = levels.map(|l| MapLevel { shape: l.shape, factor: l.factor, halved: l.halved });
+        MapJob::new(graph.wires[map.source].dtype, levels.collect())
     }
 
     /// The last level that bricks make by themselves.

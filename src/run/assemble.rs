@@ -11,6 +11,7 @@ use super::steps::MaskValue;
 use super::value::{Comp, Value};
 use crate::Result;
 use crate::brick::{Pool, Scratch, Voxels, gather};
+use crate::gpu::Gpu;
 use crate::grid::{AnyView, Region, View};
 use crate::kernel::convert::{Mapping, convert_at};
 use crate::kernel::reduce::{Cells, Level0, planes};
@@ -85,6 +86,8 @@ pub struct Assembler<'a> {
     pub targets: &'a [Option<Target>],
     pub pool: &'a Pool,
     pub level: Level,
+    /// Makes the occlusion maps that the plan placed on it.
+    pub gpu: Option<&'a Gpu>,
 }
 
 /// Where the parts of one component go.

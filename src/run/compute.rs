@@ -11,7 +11,7 @@ use super::value::Value;
 use crate::Result;
 use crate::brick::Scratch;
 use crate::grid::Region;
-use crate::plan::graph::{StepId, WireId};
+use crate::plan::graph::{Step, StepId, WireId};
 
 /// A brick whose sinks are made.
 #[derive(Debug)]
@@ -52,10 +52,24 @@ pub fn evaluate(
         masks.iter().filter(|(_, m)| matches!(m, MaskValue::None) && engine.skip).map(|(s, _)| *s).collect();
     let needed = program.needed(plan, &off);
     let (mut masked, mut constant, mut ran) = (false, false, false);
+    let mut made = Vec::new();
     for (at, &s) in program.steps.iter().enumerate() {
         let step = &plan.graph.steps[s];
-        if !step.outputs.iter().any(|&w| needed[w]) {
+        if !step.outputs.iter().any(|&w| needed[w]) || made.contains(&s) {
             continue;
+        }
+        if let Some(reader) = plan.chains[s].filter(|&t| program.steps.contains(&t) && !off.contains(&t)) {
+            let boxes = [s, reader].map(|s| program.step_box(plan, s, brick));
+            let start = Instant::now();
+            if let Some(outputs) = engine.chained([s, reader], &mut values, boxes, volume)? {
+                ran = true;
+                made.push(reader);
+                metrics.step(s, start, boxes[0].voxels() as u64);
+                metrics.step(reader, Instant::now(), boxes[1].voxels() as u64);
+                trace.span(&plan.graph.steps[reader].stages.join("+"), start, &[("brick", format!("{brick:?}"))]);
+                keep(engine, program, &plan.graph.steps[reader], outputs, &needed, at, &mut values);
+                continue;
+            }
         }
         let region = program.step_box(plan, s, brick);
         if let Some(mask) = &step.mask
@@ -80,18 +94,7 @@ pub fn evaluate(
             metrics.step(s, start, region.voxels() as u64);
             trace.span(&step.stages.join("+"), start, &[("brick", format!("{brick:?}"))]);
         }
-        for (value, &w) in outputs.into_iter().zip(&step.outputs) {
-            if needed[w] {
-                values[w] = Some(value);
-            } else {
-                value.recycle(engine.pool);
-            }
-        }
-        for (w, value) in values.iter_mut().enumerate() {
-            if value.is_some() && !program.wanted_after(plan, at, w) {
-                value.take().into_iter().for_each(|v| v.recycle(engine.pool));
-            }
-        }
+        keep(engine, program, step, outputs, &needed, at, &mut values);
     }
     let plain_constant = program.steps.is_empty()
         && program.sinks.iter().all(|&w| values[w].as_ref().is_some_and(|v| v.constants().is_some()));
@@ -103,4 +106,28 @@ pub fn evaluate(
         _ => metrics.computed(),
     }
     Ok(Finished { brick, values, masks })
+}
+
+/// Keeps what a step made and somebody needs, and gives back what nobody reads after the step at position `at`.
+fn keep(
+    engine: &Engine,
+    program: &Program,
+    step: &Step,
+    outputs: Vec<Value>,
+    needed: &[bool],
+    at: usize,
+    values: &mut [Option<Value>],
+) {
+    for (value, &w) in outputs.into_iter().zip(&step.outputs) {
+        if needed[w] {
+            values[w] = Some(value);
+        } else {
+            value.recycle(engine.pool);
+        }
+    }
+    for (w, value) in values.iter_mut().enumerate() {
+        if value.is_some() && !program.wanted_after(engine.plan, at, w) {
+            value.take().into_iter().for_each(|v| v.recycle(engine.pool));
+        }
+    }
 }

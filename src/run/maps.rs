@@ -3,12 +3,12 @@
 use super::assemble::{Assembler, Item, Place, Target, TaskSlot, as_bytes};
 use super::compute::Finished;
 use super::value::Comp;
-use crate::Result;
 use crate::brick::Scratch;
 use crate::grid::{AnyView, Region, View};
 use crate::kernel::Context;
 use crate::kernel::occlusion_map::{Moments, base, coarsen, needed};
 use crate::plan::{MapPlan, OutputPlan};
+use crate::{Error, Result};
 
 /// Makes every level of the map that the brick owns; cells of the last one are kept for the levels beyond.
 #[allow(clippy::too_many_arguments)]
@@ -24,11 +24,20 @@ pub fn assemble(
 ) -> Result<()> {
     let map = output.map.as_ref().expect("the caller saw a map");
     let last = output.brick_level();
-    let boxes = chain_boxes(output, map, done.brick);
+    let mut boxes = chain_boxes(output, map, done.brick);
     let mut cx = Context { level: assembler.level, scratch };
-    let mut moments = base_level(assembler, output, map, done, boxes[0]);
+    let mut made = on_gpu(assembler, index, output, map, done)?.into_iter();
+    if made.len() > 0 {
+        (0..=last).for_each(|k| boxes[k] = output.level_box(k, done.brick));
+    }
+    let mut moments = match made.len() > 0 && map.first > 0 {
+        true => Moments::default(), // nobody reads the data
+        false => base_level(assembler, output, map, done, boxes[0]),
+    };
     for k in 0..=last {
-        if k > 0 {
+        if let Some(level) = (k > 0).then(|| made.next()).flatten() {
+            moments = level;
+        } else if k > 0 {
             let layout = &map.chain.levels;
             let mut coarse = Moments::default();
             coarsen(&moments, boxes[k - 1], layout[k - 1].shape, layout[k].halved, boxes[k], &mut coarse, &mut cx);
@@ -47,6 +56,30 @@ pub fn assemble(
         }
     }
     Ok(())
+}
+
+/// The levels from 1 on over the brick's own cells, where the plan placed the map on the GPU and the brick is not constant;
+/// else nothing.
+fn on_gpu(
+    assembler: &Assembler,
+    index: usize,
+    output: &OutputPlan,
+    map: &MapPlan,
+    done: &Finished,
+) -> Result<Vec<Moments>> {
+    let plan = assembler.plan;
+    let value = done.value(map.source);
+    let gpu = assembler.gpu.filter(|_| plan.map_on_gpu(index) && matches!(value.comps[0], Comp::Voxels(_)));
+    let Some((gpu, job)) = gpu.and_then(|g| Some((g, output.map_job(&plan.graph)?))) else { return Ok(Vec::new()) };
+    let origin = output.region.lo.map(|v| -v);
+    let (brick, affine) = (done.brick.shift(origin), plan.graph.wires[map.source].affine);
+    let read = job.boxes(brick)[0];
+    let src = value.view(0, read.shift(output.region.lo));
+    let levels = gpu.occlusion_levels(src, read, &job, brick, affine);
+    let (levels, _) = levels.map_err(|e| {
+        Error::Failed(format!("the occlusion map {} on the GPU: {e}; --resume continues", output.spec.name))
+    })?;
+    Ok(levels)
 }
 
 /// The box of each level, in its own cells, that the brick's levels need.

@@ -243,8 +243,8 @@ impl<'a> Session<'a> {
             slots.push(TaskSlot::new(task, region, bricks.len()));
             work.extend(bricks.into_iter().map(|brick| Work { brick, slot: slots.len() - 1 }));
         }
-        let assembler =
-            Assembler { plan: &self.plan, group, targets: &self.targets, pool: &self.pool, level: engine.level };
+        let (targets, pool, level, gpu) = (&self.targets[..], &self.pool, engine.level, self.gpu.as_ref());
+        let assembler = Assembler { plan: &self.plan, group, targets, pool, level, gpu };
         let deliver =
             |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
         let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items);

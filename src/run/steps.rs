@@ -2,12 +2,14 @@
 
 use std::collections::HashMap;
 
+use super::lanes::gradient_out;
 use super::metrics::Metrics;
 use super::value::{Comp, Value};
 use crate::Result;
 use crate::brick::{Pool, Scratch, Voxels, gather};
 use crate::config::WhereRule;
 use crate::gpu::Gpu;
+use crate::gpu::slopes::Fit;
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut, Voxel};
 use crate::kernel::moments4::{BoundOut, Codes};
 use crate::kernel::obscurance::Prepared;
@@ -15,7 +17,7 @@ use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
 use crate::kernel::{Context, gaussian, gradient, levels, mask, moments4, pointwise, rank, window};
 use crate::plan::Plan;
-use crate::plan::graph::{GradientChannel, Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
+use crate::plan::graph::{Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
 use crate::stage::WindowParams;
 
 /// What all bricks of a run share.
@@ -198,17 +200,19 @@ impl<'a> Engine<'a> {
             }
             StepKind::Gradient { size, weight, spacing, channels, stored } => {
                 let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
-                let mut out = gradient::GradientOut::default();
-                for (channel, value) in channels.iter().zip(&mut outputs) {
-                    let mut views = views_mut(value);
-                    match channel {
-                        GradientChannel::Magnitude => out.magnitude = views.pop(),
-                        GradientChannel::Vector => out.vector = Some(three(views)),
+                let out = gradient_out(channels, &mut outputs);
+                let affine = if *stored { Affine::IDENTITY } else { src.affine };
+                let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: src.missing };
+                match self.lane(id, region) {
+                    Some(gpu) => {
+                        let done = gpu.gradient(src.view(), &fit, affine, src.at, out, &mut cx);
+                        done.map_err(|e| self.gpu_failed(id, &e))?;
+                    }
+                    None => {
+                        let Fit { missing, .. } = fit;
+                        gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
                     }
                 }
-                let affine = if *stored { Affine::IDENTITY } else { src.affine };
-                let missing = src.missing;
-                gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
                 src.recycle(self.pool);
             }
             StepKind::Window { .. }
@@ -242,7 +246,7 @@ impl<'a> Engine<'a> {
                     .collect();
                 match self.lane(id, region) {
                     Some(gpu) => {
-                        let done = gpu.window(src.view(), &params, src.at, &mut outs, cx);
+                        let done = gpu.window(src.view(), &params, src.at, src.voxel, &mut outs, cx);
                         done.map_err(|e| self.gpu_failed(id, &e))?;
                     }
                     None => window::window(src.view(), &params, Place::new(src.at, src.voxel), &mut outs, cx),
@@ -275,12 +279,12 @@ impl<'a> Engine<'a> {
                         Moment::Variance => variance = Some(view_mut(value, c)),
                     }
                 }
-                match (self.lane(id, region), mean) {
-                    (Some(gpu), Some(mut mean)) => {
-                        let done = gpu.gaussian(src.view(), *sigma, src.affine, src.at, &mut mean, cx);
+                match self.lane(id, region) {
+                    Some(gpu) => {
+                        let done = gpu.gaussian(src.view(), *sigma, src.affine, src.at, mean, variance, cx);
                         done.map_err(|e| self.gpu_failed(id, &e))?;
                     }
-                    (_, mean) => {
+                    None => {
                         gaussian::gaussian(src.view(), *sigma, src.affine, src.missing, src.at, mean, variance, cx);
                     }
                 }
@@ -350,7 +354,7 @@ impl<'a> Engine<'a> {
     }
 
     /// The input of a window kernel: the box grown by the reach, clipped or extended by the border rule.
-    fn windowed<'v>(
+    pub(super) fn windowed<'v>(
         &self,
         step: &Step,
         value: &'v Value,
@@ -400,9 +404,9 @@ impl<'a> Engine<'a> {
 }
 
 /// A kernel's input with the place of the output box in it.
-struct Windowed<'a> {
+pub(super) struct Windowed<'a> {
     src: Src<'a>,
-    at: [usize; 3],
+    pub at: [usize; 3],
     /// The output box's first voxel in the volume.
     voxel: [i64; 3],
     affine: Affine,
@@ -415,14 +419,14 @@ enum Src<'a> {
 }
 
 impl Windowed<'_> {
-    fn view(&self) -> AnyView<'_> {
+    pub fn view(&self) -> AnyView<'_> {
         match &self.src {
             Src::Borrowed(v) => *v,
             Src::Owned(v, shape) => v.view(*shape),
         }
     }
 
-    fn recycle(self, pool: &Pool) {
+    pub fn recycle(self, pool: &Pool) {
         if let Src::Owned(v, _) = self.src {
             pool.put(v);
         }

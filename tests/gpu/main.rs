@@ -1,12 +1,15 @@
-//! CPU and GPU agree (SPEC 5.6). Every result of the lane must equal the CPU's **bit for bit**: sums, extremes and
-//! contributions are exact integers, and the CPU's own row functions finish them. That is the one tolerance of these tests:
-//! none.
+//! CPU and GPU agree (SPEC 5.6). What is made of sums, extremes and contributions in exact integers must equal the CPU's
+//! **bit for bit**, since the CPU's own row functions finish them; floats must lie within `facts::tolerance`.
 //!
 //! Without a Vulkan adapter these tests pass and are listed when all have run, unless OCCLUDE_REQUIRE_GPU_TESTS=1.
 
+mod chains;
 #[path = "../common/mod.rs"]
 mod common;
+mod float_windows;
 mod gaussian;
+mod gradient;
+mod maps;
 mod obscurance;
 mod runs;
 mod windows;

@@ -1,4 +1,4 @@
-//! What another device needs for the mean: half-widths, weights, and the last step from unscaled means to results.
+//! What another device needs: half-widths, weights, and the last step from unscaled moments to results.
 
 use super::rows::store_row;
 use crate::grid::{Affine, AnyViewMut, Shape};
@@ -20,7 +20,12 @@ pub fn weights(sigma: f64, radius: usize, p: usize, n: usize) -> impl Iterator<I
     })
 }
 
-/// Scales one row of means as [`super::gaussian`] does, into voxels `to..` of a row of `dst`.
+/// What is left for the centre.
+pub fn centre_weight(sigma: f64, radius: usize, p: usize, n: usize) -> f32 {
+    (1.0 / super::total(|k| super::bell(sigma, k), radius, p, n - 1 - p)) as f32
+}
+
+/// Scales one row of means as [`super::gaussian`] does (variances by the squared slope and no intercept), into voxels `to..` of a row of `dst`.
 ///
 /// Panics if `dst` is not f32.
 pub fn finish(level: Level, row: &[f32], affine: Affine, dst: &mut AnyViewMut, [z, y, x]: [usize; 3]) {

@@ -7,6 +7,7 @@
 //! that has not would pay fifty times over.
 
 mod regression;
+pub mod shared;
 
 use std::marker::PhantomData;
 

@@ -208,17 +208,18 @@ fn empty_rows(job: &Job, tile: &Tile, kept: usize, plane: usize) -> impl Iterato
 }
 
 /// Finished windows of one row.
-struct Row<'a, T: Float> {
-    v: &'a [T],
-    lo: &'a [T],
-    hi: &'a [T],
-    s: &'a [T::Total],
-    m: &'a [f64],
+pub struct Row<'a, T: Float> {
+    pub v: &'a [T],
+    pub lo: &'a [T],
+    pub hi: &'a [T],
+    pub s: &'a [T::Total],
+    pub m: &'a [f64],
     /// Counts of the row start there in `Emit::numerator`.
-    skip: usize,
+    pub skip: usize,
 }
 
-fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool) {
+/// Writes a row that starts at output voxel `at`; `masked` where voxels may be NaN.
+pub fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool) {
     let (level, len) = (emit.level, row.v.len());
     let n = &emit.numerator[row.skip..row.skip + len];
     let needs = Needs::of(emit.outs.iter().map(|o| o.channel), true);

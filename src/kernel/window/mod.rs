@@ -17,6 +17,7 @@ mod exact;
 mod extremes;
 mod far;
 pub mod finish;
+pub mod finish_floats;
 mod float;
 mod float_estimate;
 mod int;

@@ -1,0 +1,88 @@
+// What Gaussian passes along one axis share: parameters, bindings, where the taps of a thread's output lie, the entry points.
+// A shader adds `smooth_at`, which makes one output.
+//
+// Parameters: src/gpu/taps.rs, struct Taps. Weights come from the CPU, in f64 and rounded.
+// Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no atomics: an output has one writer.
+
+struct Taps {
+    n: u32,         // extent of the whole source along the axis
+    at: u32,        // centre of output 0, in the whole source
+    start: u32,     // first position of the whole source that the input holds
+    m: u32,         // outputs along the axis
+    radius: u32,
+    in_axis: u32,   // strides, in elements: the input's along the axis and of a line's two indices
+    in_i: u32,
+    in_j: u32,
+    out_axis: u32,  // the output's
+    out_i: u32,
+    out_j: u32,
+    inner: u32,     // extents, the fastest first: of the outputs' x, and of their y
+    middle: u32,
+    axis: u32,      // which of z, y, x the axis is; i and j are the others in this order
+    weights: u32,   // where the axis' weights start
+    packing: u32,   // log2 of voxels per word
+    sign: u32,      // the sign bit of a packed voxel, or 0
+    zero: u32,      // 0, which no compiler knows
+    threads: u32,
+    centres: u32,   // where the centres' weights of the axis start (variance)
+    last: u32,      // 1: of a cell only the variance is kept
+    spare_0: u32,
+    spare_1: u32,
+    spare_2: u32,
+}
+
+@group(0) @binding(0) var<uniform> p: Taps;
+@group(0) @binding(1) var<storage, read> input: array<u32>;
+@group(0) @binding(2) var<storage, read_write> output: array<u32>;
+@group(0) @binding(3) var<storage, read> weights: array<u32>;
+
+// Where an output's centre stands in the input, how many taps exist before and after it, where its weights start, its place
+// among the outputs along the axis, and its own.
+struct Centre {
+    here: u32,
+    before: u32,
+    after: u32,
+    weights: u32,
+    k: u32,
+    output: u32,
+}
+
+fn centre_of(thread: u32) -> Centre {
+    let x = thread % p.inner;
+    let y = (thread / p.inner) % p.middle;
+    let z = thread / (p.inner * p.middle);
+    var k = z;
+    var i = y;
+    var j = x;
+    if p.axis == 1u {
+        k = y;
+        i = z;
+    }
+    if p.axis == 2u {
+        k = x;
+        i = z;
+        j = y;
+    }
+    let centre = p.at + k;
+    let here = i * p.in_i + j * p.in_j + (centre - p.start) * p.in_axis;
+    let place = k * p.out_axis + i * p.out_i + j * p.out_j;
+    return Centre(here, centre, p.n - 1u - centre, p.weights + k * p.radius, k, place);
+}
+
+@compute @workgroup_size(64)
+fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+         @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread < p.threads {
+        smooth_at(centre_of(thread), true);
+    }
+}
+
+@compute @workgroup_size(64)
+fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread < p.threads {
+        smooth_at(centre_of(thread), false);
+    }
+}

@@ -1,0 +1,70 @@
+// What the passes over windows share: their parameters, which part of which line a thread takes, and the entry points. A
+// shader adds `walk`, which makes the outputs of one block of one line.
+//
+// Parameters: src/gpu/passes.rs, struct Pass. Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no
+// atomics: an output has one writer.
+
+struct Pass {
+    n: u32,         // extent of the input along the axis
+    m: u32,         // outputs along the axis
+    first: i32,     // input index of the first voxel of window 0; negative: cut there
+    window: u32,    // 2 r + 1
+    in_axis: u32,   // strides, in elements: the input's along the axis and of a line's two indices
+    in_i: u32,
+    in_j: u32,
+    out_axis: u32,  // the output's
+    out_i: u32,
+    out_j: u32,
+    lines: u32,     // extent of the line index i
+    blocks: u32,    // blocks per line
+    block: u32,     // outputs per block
+    along: u32,     // 1: neighbouring threads take neighbouring blocks of a line (x), 0: neighbouring lines
+    packing: u32,   // log2 of voxels per word
+    flip: u32,      // XOR that turns stored bits into codes
+    square: u32,    // 1: the first pass sums squares of codes; cells of moments hold M2
+    threads: u32,
+    phase: u32,     // outputs of block 0 that lie before output 0 (floats)
+    zero: u32,      // 0, which no compiler knows
+    cell: u32,      // words of a cell of moments
+    spare_0: u32,
+    spare_1: u32,
+    spare_2: u32,
+}
+
+@group(0) @binding(0) var<uniform> p: Pass;
+
+// Where a thread's line starts in the input and the output, and the number of its block.
+struct Line {
+    input: u32,
+    output: u32,
+    block: i32,
+}
+
+fn line_of(thread: u32) -> Line {
+    var i = thread % p.lines;
+    var b = (thread / p.lines) % p.blocks;
+    if p.along == 1u {
+        b = thread % p.blocks;
+        i = (thread / p.blocks) % p.lines;
+    }
+    let j = thread / (p.lines * p.blocks);
+    return Line(i * p.in_i + j * p.in_j, i * p.out_i + j * p.out_j, i32(b));
+}
+
+@compute @workgroup_size(64)
+fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+         @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread < p.threads {
+        walk(line_of(thread), true);
+    }
+}
+
+@compute @workgroup_size(64)
+fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread < p.threads {
+        walk(line_of(thread), false);
+    }
+}

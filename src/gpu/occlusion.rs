@@ -1,0 +1,74 @@
+//! Occlusion maps on the device: pooled moments there, scaled here.
+
+use super::engine::{Gpu, GpuError, Times, run_part};
+use super::facts;
+use super::maps::{CELL, MapJob};
+use super::passes::Part;
+use super::windows::{cast, pack};
+use crate::grid::{Affine, AnyView, Region};
+use crate::kernel::occlusion_map::Moments;
+
+impl Gpu {
+    /// The levels from 1 on of an occlusion map over a brick, scaled by `affine`: each over the cells that the brick owns, as
+    /// by [`crate::kernel::occlusion_map::coarsen`] within [`facts::tolerance`]. `src` covers `src_box`, which holds what
+    /// [`MapJob::boxes`] of the brick reads; all boxes are counted from the start of the map. After a failure the device is
+    /// opened anew and the call tried once more.
+    ///
+    /// # Errors
+    /// An input without a kernel, a cell that does not fit the device, or a second failure of the device.
+    pub fn occlusion_levels(
+        &self,
+        src: AnyView,
+        src_box: Region,
+        job: &MapJob,
+        brick: Region,
+        affine: Affine,
+    ) -> Result<(Vec<Moments>, Times), GpuError> {
+        facts::occlusion_map(src.dtype(), false).map_err(|e| GpuError(e.into()))?;
+        let read = job.boxes(brick)[0];
+        assert!(src_box.contains(&read), "voxels {read:?} are needed, {src_box:?} are given");
+        let parts = job.parts(brick, self.cap()).ok_or_else(|| GpuError("a cell does not fit its buffers".into()))?;
+        self.attempt(|device| {
+            let mut times = Times::default();
+            let mut levels: Vec<Moments> = (1..job.levels()).map(|k| room(job.own(k, brick).voxels())).collect();
+            for &part in &parts {
+                let boxes = job.boxes(part);
+                let shape = boxes[0].shape();
+                let seen = Part { lo: [0; 3], dst: shape, from: src_box.offset_of(&boxes[0]), src: shape };
+                let pitch = job.pitch(boxes[0]) * job.voxel;
+                let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, pitch, out);
+                let mut done = |bytes: Option<&[u8]>| {
+                    for (k, to) in (1..).zip(&mut levels) {
+                        let cells = cast(&bytes.unwrap_or_default()[job.place(&boxes, k)])?;
+                        paste(cells, boxes[k], job.own(k, part), job.own(k, brick), affine, to);
+                    }
+                    Ok(())
+                };
+                run_part(device, &job.record(part), &mut fill, &mut done, &mut times)?;
+            }
+            Ok((levels, times))
+        })
+    }
+}
+
+fn room(cells: usize) -> Moments {
+    Moments { mean: vec![0.0; cells], variance: vec![0.0; cells] }
+}
+
+/// Copies the cells of `own`, which lie in those of `have`, to their places in `brick`.
+fn paste(cells: &[u32], have: Region, own: Region, brick: Region, affine: Affine, to: &mut Moments) {
+    let place = |r: Region, z: i64, y: i64, x: i64| {
+        let ([_, ny, nx], v) = (r.shape(), [z - r.lo[0], y - r.lo[1], x - r.lo[2]].map(|v| v as usize));
+        (v[0] * ny + v[1]) * nx + v[2]
+    };
+    let number = |w: u32| f32::from_bits(w) as f64;
+    let n = own.shape()[2];
+    for (z, y) in (own.lo[0]..own.hi[0]).flat_map(|z| (own.lo[1]..own.hi[1]).map(move |y| (z, y))) {
+        let from = &cells[CELL * place(have, z, y, own.lo[2])..][..CELL * n];
+        let start = place(brick, z, y, own.lo[2]);
+        for (x, cell) in from.chunks_exact(CELL).enumerate() {
+            to.mean[start + x] = affine.slope * (number(cell[0]) + number(cell[1])) + affine.intercept;
+            to.variance[start + x] = affine.slope * affine.slope * number(cell[2]);
+        }
+    }
+}

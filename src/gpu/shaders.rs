@@ -1,0 +1,99 @@
+//! The shaders: texts put together of the files under `shaders/`, entry points, bindings.
+
+/// A text and the files that it is made of, without their ending, in their order.
+struct Composed {
+    files: &'static [&'static str],
+    text: &'static str,
+}
+
+/// WGSL has no include: what shaders share stands before them.
+macro_rules! composed {
+    ($($file:literal),*) => {
+        Composed {
+            files: &[$($file),*],
+            text: concat!($(include_str!(concat!("../../shaders/", $file, ".wgsl")), "\n"),*),
+        }
+    };
+}
+
+/// The shaders, each with its text and entry points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shader {
+    Extremes,
+    Sums32,
+    Sums64,
+    Obscurance,
+    Gaussian,
+    Gradient,
+    Order,
+    Moments,
+    GaussianVariance,
+    Finish,
+    MapPool,
+}
+
+impl Shader {
+    pub const ALL: [Shader; 11] = [
+        Shader::Extremes,
+        Shader::Sums32,
+        Shader::Sums64,
+        Shader::Obscurance,
+        Shader::Gaussian,
+        Shader::Gradient,
+        Shader::Order,
+        Shader::Moments,
+        Shader::GaussianVariance,
+        Shader::Finish,
+        Shader::MapPool,
+    ];
+
+    fn composed(self) -> Composed {
+        match self {
+            Shader::Extremes => composed!("common", "window_pass", "window_herk", "window_kept", "window_extremes"),
+            Shader::Sums32 => composed!("common", "window_pass", "window_sums", "window_sums32"),
+            Shader::Sums64 => composed!("common", "window_pass", "window_sums", "window_sums64"),
+            Shader::Obscurance => composed!("common", "obscurance"),
+            Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian"),
+            Shader::Gradient => composed!("common", "gradient"),
+            Shader::Order => composed!("common", "window_pass", "window_herk", "window_kept", "window_order"),
+            Shader::Moments => composed!("common", "floats", "pairs", "window_pass", "window_herk", "window_moments"),
+            Shader::GaussianVariance => {
+                composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_variance")
+            }
+            Shader::MapPool => composed!("common", "floats", "pairs", "cells", "map_pool"),
+            Shader::Finish => composed!("common", "floats", "pairs", "window_finish"),
+        }
+    }
+
+    /// Names of its files under `shaders/`, without the ending, in the order in which they are put together.
+    pub fn files(self) -> &'static [&'static str] {
+        self.composed().files
+    }
+
+    /// Its own file's name, the last one.
+    pub fn name(self) -> &'static str {
+        self.files().last().expect("a shader has a file")
+    }
+
+    pub fn text(self) -> &'static str {
+        self.composed().text
+    }
+
+    pub fn entries(self) -> &'static [&'static str] {
+        match self {
+            Shader::Obscurance => &["sweep"],
+            Shader::Gradient => &["slopes"],
+            Shader::Finish => &["finish"],
+            _ => &["first", "next"],
+        }
+    }
+
+    /// Storage bindings after the uniform one: read, written, read, written, as many of them as the shader has.
+    pub fn bindings(self) -> usize {
+        match self {
+            Shader::Obscurance | Shader::Finish => 4,
+            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
+            _ => 2,
+        }
+    }
+}
