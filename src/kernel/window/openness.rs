@@ -458,7 +458,7 @@ mod tests {
                     spread_row(level, kind, &row(&w, &narrow, 0, 30_000), &spread, polarity, &mut out);
                     assert_eq!(wide, out, "{level:?}");
                     assert_eq!(first.get_or_insert_with(|| out.clone()), &out, "{level:?}");
-                    for i in 0..len {
+                    for (i, got) in out.iter().enumerate() {
                         let d = w.n[i] as f64 * w.v[i] as f64 - w.s1[i] as f64;
                         let (d, m) = (if flipped { -d } else { d }, spread[i]);
                         let exact = match kind {
@@ -479,7 +479,7 @@ mod tests {
                                 }
                             }
                         };
-                        assert!((out[i] as f64 - exact).abs() < 6e-7, "{kind:?} {level:?} {i}: {} {exact}", out[i]);
+                        assert!((*got as f64 - exact).abs() < 6e-7, "{kind:?} {level:?} {i}: {got} {exact}");
                     }
                 }
             }
