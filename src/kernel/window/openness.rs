@@ -424,7 +424,7 @@ mod tests {
                 cdf_power_row(level, &row(&w, &narrow, 0, 30_000), &w.lo, &w.hi, polarity, &mut out);
                 assert_eq!(wide, out, "{level:?}");
                 assert_eq!(first.get_or_insert_with(|| out.clone()), &out, "{level:?}");
-                for i in 0..len {
+                for (i, got) in out.iter().enumerate() {
                     let (v, lo, hi, s, n) =
                         (w.v[i] as f64, w.lo[i] as f64, w.hi[i] as f64, w.s1[i] as f64, w.n[i] as f64);
                     let (a, p, q) = match flipped {
@@ -435,8 +435,8 @@ mod tests {
                     let log = if t > 0.5 { ((a - (hi - lo)) / (hi - lo)).ln_1p() } else { t.ln() };
                     let exact =
                         if hi == lo { polarity.constant as f64 } else { ((p / q).clamp(1e-6, 1e6) * log).exp() };
-                    assert!((out[i] as f64 - exact).abs() < 2e-6, "{level:?} {i}: {} {exact}", out[i]);
-                    assert!(hi > lo || out[i] == polarity.constant, "constant windows are exact");
+                    assert!((*got as f64 - exact).abs() < 2e-6, "{level:?} {i}: {got} {exact}");
+                    assert!(hi > lo || *got == polarity.constant, "constant windows are exact");
                 }
             }
         }
