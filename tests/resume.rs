@@ -100,6 +100,19 @@ fn killed_at_random_moments_it_resumes_to_the_same_bytes() {
     }
 }
 
+#[test]
+fn a_kill_before_the_tidying_leaves_no_work_folder_behind() {
+    let dir = folder();
+    run(dir.path(), CONFIG, &[]);
+    for name in ["ao.zarr", "mean.zarr"] {
+        let work = dir.path().join(format!("out/{name}.occlude"));
+        fs::create_dir_all(work.join("tmp")).unwrap();
+        fs::write(work.join("meta.json"), "{ \"format\": \"zarr\", \"complete\": false }").unwrap();
+        assert!(start(dir.path()).spawn().unwrap().wait().unwrap().success());
+        assert!(!work.exists(), "{name}");
+    }
+}
+
 /// Raises a cancel at the first word of progress.
 struct StopSoon(Cancel);
 

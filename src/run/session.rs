@@ -122,7 +122,8 @@ impl<'a> Session<'a> {
         let resume = match start {
             Start::Complete => {
                 self.done.fill(true);
-                return Ok(());
+                journal::remove(&outputs::journal_dir(&self.plan));
+                return self.plan.outputs.iter().try_for_each(|o| o.spec.forget_work());
             }
             Start::Afresh => false,
             Start::Resume { done, globals } => {
@@ -148,6 +149,9 @@ impl<'a> Session<'a> {
                 if !resume || !outputs::is_complete(&self.plan, o, &self.hash) {
                     let target = outputs::open_target(&self.plan, &self.plan.groups[g], o, &self.globals, resume)?;
                     self.targets[o] = Some(target);
+                } else if o + 1 < self.plan.outputs.len() {
+                    // The last one's folder holds the journal.
+                    self.plan.outputs[o].spec.forget_work()?;
                 }
             }
         }

@@ -118,6 +118,14 @@ pub struct Sink {
     files: Files,
 }
 
+impl SinkSpec {
+    /// Removes the work folder of a complete output, where a kill came between the last word and the tidying. Flat files keep
+    /// theirs: it says whose they are.
+    pub fn forget_work(&self) -> Result<()> {
+        if self.is_zarr() { existing::remove_work_dir(&Sink::work_dir(&self.path)) } else { Ok(()) }
+    }
+}
+
 #[derive(Debug)]
 enum Files {
     Zarr(Box<zarr::Zarr>),
@@ -196,7 +204,7 @@ impl Sink {
         match &self.files {
             Files::Zarr(zarr) => {
                 zarr.finish(&self.spec, occlude, omero_windows)?;
-                existing::remove_work_dir(&Sink::work_dir(&self.spec.path))
+                self.spec.forget_work()
             }
             Files::Flat(flat) => flat.finish(&self.spec, occlude),
         }
