@@ -46,9 +46,9 @@ pub(super) struct Buffers<'a, K> {
 pub(super) const TOGETHER: usize = 4;
 
 /// Frame axis along which lines of a family run, and the one across which its sheets follow each other.
-fn axes(family: &Family) -> (usize, usize) {
+pub(super) fn axes(family: &Family) -> [usize; 2] {
     let along = usize::from(family.axis == 1);
-    (along, 1 - along)
+    [along, 1 - along]
 }
 
 /// Frame of the keys that a family reads; see [`FRAMES`].
@@ -58,14 +58,14 @@ pub(super) fn frame_of(family: &Family) -> usize {
 
 /// Families sorted so that those that can be swept together stand together.
 pub(super) fn sort(families: &mut [Family]) {
-    let key = |f: &Family| (f.axis, f.slope[FRAMES[frame_of(f)][axes(f).1]]);
+    let key = |f: &Family| (f.axis, f.slope[FRAMES[frame_of(f)][axes(f)[1]]]);
     families.sort_by(|a, b| key(a).0.cmp(&key(b).0).then(key(a).1.total_cmp(&key(b).1)));
 }
 
 /// Runs of sorted families that are swept together.
 pub(super) fn groups(families: &[Family]) -> impl Iterator<Item = &[Family]> {
     let alike = |f: &Family, g: &Family| {
-        let b = FRAMES[frame_of(f)][axes(f).1];
+        let b = FRAMES[frame_of(f)][axes(f)[1]];
         f.axis == g.axis && f.slope[b] == g.slope[b]
     };
     families.chunk_by(alike).flat_map(|run| run.chunks(TOGETHER))
@@ -88,7 +88,7 @@ pub(super) fn sweep_group<K: Key, S: Sink>(
     sink: &mut S,
 ) {
     let perm = FRAMES[frame_of(&group[0])];
-    let (a, b) = axes(&group[0]);
+    let [a, b] = axes(&group[0]);
     let planes = volume.region.shape()[a];
     let origin = volume.region.lo[a];
     let Buffers { sheet, hits, stack, starts, turned, shifts, tables } = buffers;
@@ -296,13 +296,14 @@ fn place<K: Key>(
     starts: &mut [usize],
 ) {
     let b = 1 - a;
-    let n = volume.region.shape();
-    let (lo_b, lo_c) = (volume.region.lo[b], volume.region.lo[2]);
+    let Region { lo, hi } = volume.region;
+    let last = hi[2] - lo[2];
     let shifts = shift_b[first..].iter().zip(&shift_c[first..]);
     for ((plane, start), (&d_b, &d_c)) in (first..).zip(starts).zip(shifts) {
-        let (j, k) = (s_b + d_b as i64 - lo_b, s_c + d_c as i64 - lo_c);
-        let inside = (0..n[b] as i64).contains(&j) && (-(LANES as i64)..n[2] as i64).contains(&k);
-        let (i0, i1) = if a == 0 { (plane, j as usize) } else { (j as usize, plane) };
+        let (j, k) = (s_b + d_b as i64, s_c + d_c as i64 - lo[2]);
+        let inside = (lo[b]..hi[b]).contains(&j) && (-(LANES as i64)..last).contains(&k);
+        let row = volume.sheared.map_or(j - lo[b], |first| s_b - first) as usize;
+        let (i0, i1) = if a == 0 { (plane, row) } else { (row, plane) };
         *start = if inside { volume.start(i0, i1, k) } else { 0 };
     }
 }

@@ -5,11 +5,14 @@
 //! | `lines` | directions to families of lines, distances, fixed-point contributions |
 //! | `keys` | voxels to padded, order-preserving unsigned keys |
 //! | `driver` | tiles, sheets, senses |
+//! | `column`, `stream` | sweeps of boxes whose halos do not fit into memory |
 //! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide` and `turn`: by AVX-512 |
 //! | `sinks`, `contribute` | what is summed |
+//! | `room` | how scratch is cut up |
 //! | `shared` | what another device needs |
 //! | `reference` | all of it by the definition |
 
+mod column;
 mod contribute;
 mod driver;
 mod keys;
@@ -18,9 +21,11 @@ mod lines;
 mod narrow;
 #[cfg(test)]
 mod reference;
+mod room;
 mod scan;
 pub mod shared;
 mod sinks;
+mod stream;
 #[cfg(test)]
 mod tests;
 #[cfg(target_arch = "x86_64")]
@@ -33,11 +38,13 @@ use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::simd::Level;
 use crate::stage::{DirectionSet, DirectionWeights, Rho};
 use crate::with_view;
-use driver::{Buffers, FRAMES, TOGETHER, in_frame};
-use keys::{Coded, Key, LANES, Plain, Volume};
+use driver::{Buffers, FRAMES, in_frame};
+use keys::{Coded, Key, Volume};
+use room::{Sizes, carve, carve_all};
 use sinks::{OpenSum, Sink, WeightedSum};
 
 pub use lines::{is_valid_count, rho};
+pub use stream::Fetch;
 
 /// Parameters with units resolved.
 #[derive(Debug, Clone, PartialEq)]
@@ -159,14 +166,7 @@ impl Prepared {
         let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()));
         let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
-        let (sheet, bytes) = carve::<T::Key>(bytes, sizes.sheet * LANES);
-        let (hits, bytes) = carve_all::<u32, 2>(bytes, sizes.queries * LANES);
-        let (stack, bytes) = carve::<u32>(bytes, sizes.sheet);
-        let (starts, bytes) = carve::<usize>(bytes, sizes.sheet);
-        let (turned, bytes) = carve::<u8>(bytes, sizes.turned(size_of::<T>()));
-        let (shifts, bytes) = carve_all::<i32, { 1 + TOGETHER }>(bytes, sizes.extent);
-        let (forward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
-        let (backward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
+        let (buffers, bytes) = sizes.buffers::<T::Key>(bytes);
 
         let missing = keys::missing_of::<T>(self.params.missing);
         let code = keys::Code { missing, flipped: self.params.flipped };
@@ -191,14 +191,12 @@ impl Prepared {
             },
             src_box,
             dst_box,
-            buffers: Buffers { sheet, hits, stack, starts, turned, shifts, tables: [forward, backward] },
+            buffers,
         };
         // NaN where a voxel of the row that starts at `p` is missing.
         let gone = |p: [i64; 3], row: &mut [f32]| {
             let [z, y, x] = [0, 1, 2].map(|a| (p[a] - src_box.lo[a]) as usize);
-            for (out, &v) in row.iter_mut().zip(&src.row_at(z, y)[x..]) {
-                *out = if keys::is_missing(v, missing) { f32::NAN } else { *out };
-            }
+            mark_missing(&src.row_at(z, y)[x..], missing, row);
         };
         pass.tiles(io, bytes, &gone);
     }
@@ -294,7 +292,7 @@ impl<K: Key> Pass<'_, K> {
                     let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
                     match fast {
                         true if self.flat => row.fill(1.0),
-                        true => fast_sum.openness([z, y], total, row),
+                        true => fast_sum.openness([z, y], 0, total, row),
                         false => row.iter_mut().zip(first..).for_each(|(out, i)| *out = wide_sum.openness(i)),
                     }
                     gone(row);
@@ -320,66 +318,16 @@ impl<K: Key> Pass<'_, K> {
     }
 }
 
+/// NaN where a voxel of a row is missing.
+fn mark_missing<T: Coded>(voxels: &[T], missing: Option<T>, row: &mut [f32]) {
+    for (out, &v) in row.iter_mut().zip(voxels) {
+        *out = if keys::is_missing(v, missing) { f32::NAN } else { *out };
+    }
+}
+
 fn f32_view(view: AnyViewMut) -> ViewMut<f32> {
     match view {
         AnyViewMut::F32(v) => v,
         other => panic!("obscurance writes f32, not {}", other.dtype()),
     }
-}
-
-/// Elements of the parts of the scratch.
-struct Sizes {
-    /// Padded copies: natural, and with x and z exchanged, or one in the place of both.
-    keys: [usize; 2],
-    /// Sums of both frames of a tile, and its voxels.
-    sums: [usize; 2],
-    tile: usize,
-    /// Planes of a sheet.
-    sheet: usize,
-    /// Planes of a sheet that belong to the tile.
-    queries: usize,
-    /// Longest axis of the source.
-    extent: usize,
-}
-
-impl Sizes {
-    /// Bytes of scratch of the AVX-512 search.
-    fn turned(&self, key: usize) -> usize {
-        #[cfg(target_arch = "x86_64")]
-        return wide::scratch_bytes(self.sheet, self.queries, key);
-        #[cfg(not(target_arch = "x86_64"))]
-        return 0 * key;
-    }
-
-    fn bytes(&self, key: usize, colour: bool, normal: bool) -> usize {
-        let line = |bytes: usize| bytes.next_multiple_of(64);
-        line(self.keys[0] * key)
-            + line(self.keys[1] * key)
-            + line(self.sheet * LANES * key)
-            + 2 * line(self.queries * LANES * 4)
-            + line(self.sheet * 4)
-            + line(self.sheet * size_of::<usize>())
-            + line(self.turned(key))
-            + (1 + TOGETHER) * line(self.extent * 4)
-            + 2 * TOGETHER * line((self.extent + 1) * 4)
-            + if normal { 0 } else { line(self.sums[0] * 4) + line(self.sums[1] * 4) }
-            + if normal || colour { 5 * line(self.tile * 8) } else { 0 }
-    }
-}
-
-/// Cuts `len` elements off the front of a slice that is aligned to 64 bytes.
-fn carve<T: Plain>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
-    let (head, tail) = bytes.split_at_mut((len * size_of::<T>()).next_multiple_of(64));
-    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
-    // SAFETY: aligned (just checked), long enough, and every bit pattern is valid for the integers that are `Plain`.
-    (unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }, tail)
-}
-
-fn carve_all<T: Plain, const N: usize>(mut bytes: &mut [u8], len: usize) -> ([&mut [T]; N], &mut [u8]) {
-    let parts = std::array::from_fn(|_| {
-        let (part, rest) = carve(std::mem::take(&mut bytes), len);
-        bytes = rest;
-        part
-    });
-    (parts, bytes)
 }

@@ -140,11 +140,12 @@ impl OpenSum<'_> {
         }
     }
 
-    /// Openness of row `[z, y]` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes.
-    pub fn openness(&self, [z, y]: [usize; 2], total: u64, out: &mut [f32]) {
+    /// Openness of row `[z, y]` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes, and `open` what
+    /// every voxel has beside its sums.
+    pub fn openness(&self, [z, y]: [usize; 2], open: u64, total: u64, out: &mut [f32]) {
         let [row, plane] = strides(self.tile.shape());
         for (out, &sum) in out.iter_mut().zip(&self.sums[0][z * plane + y * row..]) {
-            *out = (sum as f64 / total as f64) as f32;
+            *out = ((sum as u64 + open) as f64 / total as f64) as f32;
         }
     }
 }

@@ -1,10 +1,13 @@
 //! The sweep against the definition, closed forms, and what must not change it.
 
+use super::keys::LANES;
 use super::reference::{Field, missing, obscurance, occluder};
 use super::*;
 use crate::brick::Scratch;
 use crate::grid::Voxel;
 use crate::stage::directions;
+
+mod streamed;
 
 fn params() -> ObscuranceParams {
     ObscuranceParams {
