@@ -83,6 +83,9 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Obscurance { params, colour, normal, .. } => {
             let sweep = obscurance::Prepared::new(params);
             let wide = dtype.result() == DType::F64;
+            if step.streamed {
+                return (sweep.streamed_bytes(dtype, volume, dst) + narrowed(dst, wide) + masked(step, dst)) as u64;
+            }
             sweep.scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
                 + narrowed(src, colour.is_some())
                 + narrowed(dst, normal.is_some())
@@ -90,8 +93,12 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         }
         _ => 0,
     };
-    let mask = if step.mask.is_some() { dst.iter().product() } else { 0 };
-    (kernel + copy + mask) as u64
+    (kernel + copy + masked(step, dst)) as u64
+}
+
+/// The mask of a step.
+fn masked(step: &Step, dst: Shape) -> usize {
+    if step.mask.is_some() { dst.iter().product() } else { 0 }
 }
 
 /// f32 copies of three components that a sweep reads or writes.

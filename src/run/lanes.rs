@@ -1,7 +1,8 @@
 //! Which device runs a step on a box, and the sweep, whose operands are narrowed first, on either.
 
-use super::steps::{Engine, three, view_mut, views_mut};
-use super::value::Value;
+use super::steps::{Engine, Fetch, MaskValue, three, view_mut, views_mut};
+use super::value::{Value, common_value};
+use crate::brick::Scratch;
 use crate::gpu::{Gpu, GpuError};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
@@ -62,6 +63,43 @@ impl<'a> Engine<'a> {
             from.recycle(self.pool);
         }
         Ok(())
+    }
+
+    /// A sweep that reads the columns of its lines while it runs. A brick in which nothing can be occluded is a constant.
+    #[allow(clippy::too_many_arguments)]
+    pub(super) fn sweep_streamed(
+        &self,
+        id: StepId,
+        inputs: &[&Value],
+        mask: &MaskValue,
+        region: Region,
+        volume: Region,
+        fetch: &Fetch,
+        scratch: &mut Scratch,
+    ) -> Result<Vec<Value>> {
+        let step = &self.plan.graph.steps[id];
+        let wire = &self.plan.graph.wires[step.outputs[0]];
+        let mut openness = self.buffers(DType::F32, region, 1);
+        let mut read = |part: Region, dst: AnyViewMut| fetch(step.inputs[0], part, dst);
+        let src = inputs[0].view(0, region);
+        let mut cx = Context { level: self.level, scratch };
+        let out = view_mut(&mut openness, 0);
+        let flat = self.sweeps[&id].sweep_streamed(src, region, volume, out, &mut read, &mut cx)?;
+        if flat
+            && self.skip
+            && matches!(mask, MaskValue::All)
+            && let Some(value) = common_value(openness.view(0, region))
+        {
+            openness.recycle(self.pool);
+            return Ok(vec![Value::constant(wire.dtype, region, 1, value)]);
+        }
+        if wire.dtype == DType::F32 {
+            return Ok(vec![openness]);
+        }
+        let mut wide = self.buffers(wire.dtype, region, 1);
+        pointwise::scale(openness.view(0, region), Affine::IDENTITY, None, view_mut(&mut wide, 0));
+        openness.recycle(self.pool);
+        Ok(vec![wide])
     }
 
     /// The GPU, where it is to run a step on this box: not a single voxel, which stands for a constant brick, and not while

@@ -10,7 +10,8 @@ use super::program::Program;
 use super::steps::{Engine, MaskValue};
 use super::value::{Comp, Value, common_value, copy_into};
 use crate::Result;
-use crate::grid::{Region, Voxel};
+use crate::brick::gather;
+use crate::grid::{AnyViewMut, Region, Voxel};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
 use crate::store::Source;
@@ -71,7 +72,9 @@ impl Reader<'_> {
             }
             let Producer::Input(input) = plan.graph.wires[wire].producer else { continue };
             let region = wire_box(brick, halo, self.program.volume);
-            let (value, missing) = self.input(input, wire, region, true)?;
+            // Chunks that steps fetch while they run are read again, nobody knows how often.
+            let counts = !self.program.steps.iter().any(|&s| plan.graph.steps[s].fetched() == Some(wire));
+            let (value, missing) = self.input(input, wire, region, counts)?;
             self.metrics.gathered(region.voxels() as u64);
             loaded.all_missing &= missing;
             loaded.values[wire] = Some(value);
@@ -104,6 +107,39 @@ impl Reader<'_> {
             })
             .collect::<Result<Vec<_>>>()?;
         Ok((Value { dtype: wire.dtype, region, comps }, all_missing))
+    }
+
+    /// Reads a box of an input with one component; true if something of it is stored.
+    pub fn fetch(&self, wire: WireId, region: Region, mut dst: AnyViewMut) -> Result<bool> {
+        let start = Instant::now();
+        let Producer::Input(input) = self.engine.plan.graph.wires[wire].producer else {
+            unreachable!("steps fetch inputs")
+        };
+        let source = &self.sources[input];
+        let mut stored = false;
+        match &self.uses[input] {
+            None => {
+                self.metrics.bytes_read(source.read_again(0, region, dst)?);
+                stored = true;
+            }
+            Some(uses) => {
+                let shape = source.info().chunk.expect("a chunked source");
+                for index in uses.chunks(region).iter() {
+                    let key = (input, 0, index);
+                    let chunk_box = Region::of_cell(index, [0; 3], shape);
+                    match self.cache.get(source, key, UNCOUNTED, self.engine.pool, self.metrics)? {
+                        Chunk::Missing(value) => fill_box(dst.reborrow(), region, chunk_box, value),
+                        Chunk::Decoded(voxels) => {
+                            gather::copy_common(voxels.view(shape), chunk_box, dst.reborrow(), region);
+                            stored = true;
+                        }
+                    }
+                }
+            }
+        }
+        self.metrics.gathered(region.voxels() as u64);
+        self.metrics.read_ns.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
+        Ok(stored)
     }
 
     fn plain(&self, input: usize, comp: usize, region: Region) -> Result<Comp> {
@@ -140,7 +176,7 @@ impl Reader<'_> {
                 buffer
             });
             match &chunk {
-                Chunk::Missing(value) => fill_box(dst, region, chunk_box, *value),
+                Chunk::Missing(value) => fill_box(dst.view_mut(region.shape()), region, chunk_box, *value),
                 Chunk::Decoded(voxels) => copy_into(voxels.view(shape), chunk_box, dst, region),
             }
         }
@@ -153,7 +189,7 @@ impl Reader<'_> {
 }
 
 /// Sets the part of a dense buffer over `region` that `part` covers.
-fn fill_box(dst: &mut crate::brick::Voxels, region: Region, part: Region, value: f64) {
+fn fill_box(dst: AnyViewMut, region: Region, part: Region, value: f64) {
     fn run<T: Voxel>(mut v: crate::grid::ViewMut<T>, region: Region, part: Region, value: f64) {
         let common = part.clip(&region);
         if common.is_empty() {
@@ -166,5 +202,5 @@ fn fill_box(dst: &mut crate::brick::Voxels, region: Region, part: Region, value:
             }
         }
     }
-    crate::with_view!(AnyViewMut, dst.view_mut(region.shape()), v => run(v, region, part, value));
+    crate::with_view!(AnyViewMut, dst, v => run(v, region, part, value));
 }

@@ -14,7 +14,7 @@ use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
 use crate::kernel::{Context, gaussian, gradient, levels, mask, pointwise, rank, window};
 use crate::plan::Plan;
-use crate::plan::graph::{GradientChannel, Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
+use crate::plan::graph::{GradientChannel, Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire, WireId};
 use crate::stage::WindowParams;
 
 /// What all bricks of a run share.
@@ -31,6 +31,9 @@ pub struct Engine<'a> {
     pub gpu: Option<&'a Gpu>,
     pub(super) metrics: &'a Metrics,
 }
+
+/// Reads a box of an input's wire while a step runs.
+pub type Fetch<'a> = dyn Fn(WireId, Region, AnyViewMut) -> Result<()> + 'a;
 
 /// A mask over a step's output box: 1 = needed.
 #[derive(Debug)]
@@ -91,10 +94,11 @@ impl<'a> Engine<'a> {
         wires.map(|w| Value::constant(w.dtype, region, w.components, w.fill)).collect()
     }
 
-    /// Computes a step on `region`; `values` holds its inputs, each covering what it needs.
+    /// Computes a step on `region`; `values` holds its inputs, each covering what it needs but for what `fetch` reads.
     ///
     /// # Errors
-    /// A GPU that failed twice.
+    /// A GPU that failed twice, or an input that could not be read.
+    #[allow(clippy::too_many_arguments)]
     pub fn run(
         &self,
         id: StepId,
@@ -102,6 +106,7 @@ impl<'a> Engine<'a> {
         mask: &MaskValue,
         region: Region,
         volume: Region,
+        fetch: &Fetch,
         scratch: &mut Scratch,
     ) -> Result<Vec<Value>> {
         let step = &self.plan.graph.steps[id];
@@ -110,6 +115,7 @@ impl<'a> Engine<'a> {
         }
         if self.skip
             && matches!(mask, MaskValue::All)
+            && !step.streamed
             && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)?
         {
             return Ok(values);
@@ -119,7 +125,11 @@ impl<'a> Engine<'a> {
                 value.materialize(self.pool);
             }
         }
-        let mut outputs = self.compute(id, &inputs_of(step, values), region, volume, scratch)?;
+        let mut outputs = if step.streamed {
+            self.sweep_streamed(id, &inputs_of(step, values), mask, region, volume, fetch, scratch)?
+        } else {
+            self.compute(id, &inputs_of(step, values), region, volume, scratch)?
+        };
         if let MaskValue::Some(needed) = mask {
             for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
                 let fill = self.plan.graph.wires[w].fill;

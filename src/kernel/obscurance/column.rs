@@ -58,7 +58,7 @@ fn reaches(group: &[Family], axis: usize) -> (usize, usize) {
 
 /// Elements from plane to plane and from row to row; see [`super::keys`] for what stands between rows.
 fn strides(rows: usize, lanes: usize) -> [usize; 2] {
-    let row = lanes.next_multiple_of(64) + LANES;
+    let row = (lanes + LANES).next_multiple_of(16);
     let plane = row * rows;
     [if plane.is_multiple_of(1024) { plane + 64 } else { plane }, row]
 }

@@ -17,7 +17,7 @@ pub type Fetch<'a, E> = &'a mut dyn FnMut(Region, AnyViewMut) -> Result<(), E>;
 
 impl Prepared {
     /// [`Prepared::sweep`] of openness without weights per voxel, for a source that is fetched box by box: `src` covers
-    /// the output box alone. The bits are the same.
+    /// the output box alone. The bits are the same. True if nothing in reach is greater than any voxel.
     ///
     /// Panics if an extent does not fit its box, or the output is not f32.
     ///
@@ -31,11 +31,11 @@ impl Prepared {
         openness: AnyViewMut,
         fetch: Fetch<E>,
         cx: &mut Context,
-    ) -> Result<(), E> {
+    ) -> Result<bool, E> {
         assert_eq!(src.shape(), dst_box.shape(), "src must cover the output box");
         assert!(volume.contains(&dst_box), "{volume:?} must contain {dst_box:?}");
         if dst_box.is_empty() {
-            return Ok(());
+            return Ok(true);
         }
         with_view!(AnyView, src, v => self.stream_typed(v, dst_box, volume, f32_view(openness), fetch, cx))
     }
@@ -80,7 +80,7 @@ impl Prepared {
         mut openness: ViewMut<f32>,
         fetch: Fetch<E>,
         cx: &mut Context,
-    ) -> Result<(), E> {
+    ) -> Result<bool, E> {
         let (sizes, slab) = self.streamed_sizes(volume.shape(), dst_box.shape());
         let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), false, false) + padded::<T>(slab));
         let (keys, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
@@ -92,13 +92,14 @@ impl Prepared {
         let missing = keys::missing_of::<T>(self.params.missing);
         let code = keys::Code { missing, flipped: self.params.flipped };
         let extents = tile_of(dst_box.shape(), false);
+        let mut flat = true;
         for cell in dst_box.cells(dst_box.lo, extents).iter() {
             let tile = Region::of_cell(cell, dst_box.lo, extents).clip(&dst_box);
             let own = src.part(dst_box.offset_of(&tile), tile.shape());
             let least = keys::least(cx.level, own, code);
             let mut sums = OpenSum { level: cx.level, sums: [&mut *natural, &mut *turned], tile };
             sums.clear();
-            let mut open = 0;
+            let (mut open, mut swept) = (0, false);
             for group in driver::groups(&self.families) {
                 let column = Column::new(group, tile, volume);
                 let mut most = T::Key::ZERO;
@@ -112,9 +113,13 @@ impl Prepared {
                     open += group.iter().map(|family| family.open()).sum::<u64>();
                     continue;
                 }
+                swept = true;
                 driver::sweep_group(cx.level, group, usize::MAX, column.volume(keys), tile, &mut buffers, &mut sums);
             }
-            sums.merge();
+            if swept {
+                sums.merge();
+                flat = false;
+            }
             let at = dst_box.offset_of(&tile);
             let [nz, ny, nx] = tile.shape();
             for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
@@ -123,6 +128,6 @@ impl Prepared {
                 mark_missing(&own.row_at(z, y)[..nx], missing, row);
             }
         }
-        Ok(())
+        Ok(flat)
     }
 }

@@ -103,6 +103,6 @@ fn a_failed_fetch_ends_the_sweep() {
         left -= 1;
         if left == 0 { Err("gone") } else { Ok(()) }
     };
-    assert_eq!(Prepared::new(&params()).sweep_streamed(view, region, region, dst, &mut fetch, &mut cx), Err("gone"));
+    assert_eq!(Prepared::new(&params()).sweep_streamed(view, region, region, dst, &mut fetch, &mut cx), Err::<bool, _>("gone"));
     assert_eq!(left, 0);
 }
