@@ -167,13 +167,18 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     // and the last one's writing.
     let rounds = ((bricks / threads).ceil() * threads + 0.5 * threads) / bricks;
     let short_rows = 1.0 + 24.0 / shape[2].min(region[2]) as f64;
-    let starved = if choice.in_flight > plan.workers { 1.0 } else { 1.5 + threads / choice.in_flight as f64 };
+    let starved = match choice.in_flight {
+        // Workers read for themselves.
+        n if streams::any(plan, group) => threads / (n as f64).min(threads),
+        n if n > plan.workers => 1.0,
+        n => 1.5 + threads / n as f64,
+    };
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels; beyond, the pipeline only gets coarser.
     let large = 1.0 + (shape.iter().product::<usize>() as f64 / 16e6).powi(2) * 0.1;
     let partial_chunks =
         if (0..3).any(|a| !shape[a].is_multiple_of(group.chunk[a]) && shape[a] < region[a]) { 1.15 } else { 1.0 };
     let overhead = 1.0 + 20_000.0 / shape.iter().product::<usize>() as f64;
-    choice.amplification.powf(0.8) * rounds * short_rows * starved * large * partial_chunks * overhead
+    streams::work(plan, group, choice.amplification) * rounds * short_rows * starved * large * partial_chunks * overhead
 }
 
 /// Bytes of one brick with its scratch, and of a run of such bricks one by one.

@@ -96,9 +96,13 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     (kernel + copy + masked(step, dst)) as u64
 }
 
-/// The mask of a step.
+/// The mask of a step, and what a kernel that skips keeps of it.
 fn masked(step: &Step, dst: Shape) -> usize {
-    if step.mask.is_some() { dst.iter().product() } else { 0 }
+    let kernel = match &step.kind {
+        StepKind::Obscurance { params, .. } => obscurance::Prepared::new(params).masked_bytes(dst),
+        _ => 0,
+    };
+    if step.mask.is_some() { dst.iter().product::<usize>() + kernel } else { 0 }
 }
 
 /// f32 copies of three components that a sweep reads or writes.

@@ -36,12 +36,7 @@ impl Finished {
 ///
 /// # Errors
 /// A GPU that failed twice.
-pub fn evaluate(
-    reader: &Reader,
-    loaded: Loaded,
-    scratch: &mut Scratch,
-    trace: &Trace,
-) -> Result<Finished> {
+pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &Trace) -> Result<Finished> {
     let Loaded { brick, mut values, mut masks, all_missing } = loaded;
     let Reader { engine, program, metrics, .. } = *reader;
     let stored = Cell::new(false);

@@ -20,6 +20,7 @@ impl<'a> Engine<'a> {
         [has_colour, has_normal]: [bool; 2],
         inputs: &[&Value],
         outputs: &mut [Value],
+        mask: &MaskValue,
         region: Region,
         volume: Region,
         cx: &mut Context,
@@ -40,7 +41,7 @@ impl<'a> Engine<'a> {
             narrow_outputs = outputs.iter().map(|v| self.buffers(DType::F32, region, v.comps.len())).collect();
         }
         let targets = if wide { &mut narrow_outputs[..] } else { &mut *outputs };
-        let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
+        let mut io = ObscuranceIo { colour, normal, needed: self.needed(mask, region), openness: None, rgb: None };
         for (channel, value) in channels.iter().zip(targets) {
             let mut views = views_mut(value);
             match channel {
@@ -54,7 +55,7 @@ impl<'a> Engine<'a> {
                 let done = gpu.obscurance(sweep, src, src_box, region, openness, cx);
                 done.map_err(|e| self.gpu_failed(id, &e))?;
             }
-            _ => sweep.sweep(src, src_box, region, io, cx),
+            _ => self.metrics.lines(id, sweep.sweep(src, src_box, region, io, cx)),
         }
         for (from, to) in narrow_outputs.into_iter().zip(outputs) {
             for c in 0..from.comps.len() {
@@ -63,6 +64,14 @@ impl<'a> Engine<'a> {
             from.recycle(self.pool);
         }
         Ok(())
+    }
+
+    /// The voxels that a mask leaves, for kernels that skip the others.
+    fn needed<'m>(&self, mask: &'m MaskValue, region: Region) -> Option<View<'m, u8>> {
+        match mask {
+            MaskValue::Some(needed) if self.skip => Some(View::dense(needed, region.shape())),
+            _ => None,
+        }
     }
 
     /// A sweep that reads the columns of its lines while it runs. A brick in which nothing can be occluded is a constant.
@@ -84,8 +93,10 @@ impl<'a> Engine<'a> {
         let src = inputs[0].view(0, region);
         let mut cx = Context { level: self.level, scratch };
         let out = view_mut(&mut openness, 0);
-        let flat = self.sweeps[&id].sweep_streamed(src, region, volume, out, &mut read, &mut cx)?;
-        if flat
+        let needed = self.needed(mask, region);
+        let done = self.sweeps[&id].sweep_streamed(src, region, volume, needed, out, &mut read, &mut cx)?;
+        self.metrics.lines(id, done.lines);
+        if done.flat
             && self.skip
             && matches!(mask, MaskValue::All)
             && let Some(value) = common_value(openness.view(0, region))

@@ -128,7 +128,7 @@ impl<'a> Engine<'a> {
         let mut outputs = if step.streamed {
             self.sweep_streamed(id, &inputs_of(step, values), mask, region, volume, fetch, scratch)?
         } else {
-            self.compute(id, &inputs_of(step, values), region, volume, scratch)?
+            self.compute(id, &inputs_of(step, values), mask, region, volume, scratch)?
         };
         if let MaskValue::Some(needed) = mask {
             for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
@@ -166,7 +166,7 @@ impl<'a> Engine<'a> {
                 Value { dtype: v.dtype, region: one, comps: comps.collect() }
             })
             .collect();
-        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), one, one, scratch)?;
+        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), &MaskValue::All, one, one, scratch)?;
         let spread = |value: Value| {
             let comps = value.comps.iter().map(|c| match c {
                 Comp::Const(v) => Comp::Const(*v),
@@ -181,6 +181,7 @@ impl<'a> Engine<'a> {
         &self,
         id: StepId,
         inputs: &[&Value],
+        mask: &MaskValue,
         region: Region,
         volume: Region,
         scratch: &mut Scratch,
@@ -200,6 +201,7 @@ impl<'a> Engine<'a> {
                     [colour.is_some(), normal.is_some()],
                     inputs,
                     &mut outputs,
+                    mask,
                     region,
                     volume,
                     &mut cx,

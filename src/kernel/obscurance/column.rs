@@ -75,8 +75,7 @@ impl<'a> Column<'a> {
         (halo[a], halo[2]) = (reach, side);
         let mut region = tile.grow(halo).clip(&volume);
         (region.lo[b], region.hi[b]) = (volume.lo[b], volume.hi[b]);
-        let mut column =
-            Column { group, perm, axes, tile, region, reach: reach as i64, first: 0, rows: 0 };
+        let mut column = Column { group, perm, axes, tile, region, reach: reach as i64, first: 0, rows: 0 };
         let lines = column.lines(tile.lo[a]..tile.hi[a]);
         column.first = lines.start;
         column.rows = (lines.end - lines.start) as usize;
@@ -133,7 +132,14 @@ impl<'a> Column<'a> {
     }
 
     /// Puts the keys of one of [`Self::slabs`] into place, and returns the greatest.
-    pub fn put<T: Coded>(&self, level: Level, slab: Region, src: View<T>, code: Code<T>, keys: &mut [T::Key]) -> T::Key {
+    pub fn put<T: Coded>(
+        &self,
+        level: Level,
+        slab: Region,
+        src: View<T>,
+        code: Code<T>,
+        keys: &mut [T::Key],
+    ) -> T::Key {
         assert_eq!(src.shape, slab.shape());
         keys[..LANES].fill(T::Key::ZERO);
         let part = in_frame(slab, self.perm);

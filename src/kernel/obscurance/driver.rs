@@ -11,6 +11,7 @@ use super::keys::{Key, LANES, Volume};
 use super::lines::{Family, displacement};
 use super::scan::{self, Hit, Sheet, Spans};
 use super::sinks::{Sink, Strip, Visit};
+use super::wanted::{LineCounts, Wanted};
 use crate::grid::Region;
 use crate::kernel::simd::Level;
 
@@ -77,16 +78,19 @@ pub(super) fn reach_in(family: &Family, extent: usize) -> usize {
 }
 
 /// Sweeps both senses of a group of families (see [`groups`]) over `tile` (natural order), reading the keys of their
-/// frame and looking `most` planes ahead at most. Answers are "open" wherever nothing is in reach.
+/// frame and looking `most` planes ahead at most. Answers are "open" wherever nothing is in reach, and for lines without a
+/// voxel that is `wanted`.
+#[allow(clippy::too_many_arguments)]
 pub(super) fn sweep_group<K: Key, S: Sink>(
     level: Level,
     group: &[Family],
     most: usize,
     volume: Volume<K>,
     tile: Region,
+    wanted: Option<Wanted>,
     buffers: &mut Buffers<K>,
     sink: &mut S,
-) {
+) -> LineCounts {
     let perm = FRAMES[frame_of(&group[0])];
     let [a, b] = axes(&group[0]);
     let planes = volume.region.shape()[a];
@@ -125,12 +129,12 @@ pub(super) fn sweep_group<K: Key, S: Sink>(
     });
     let mut room = Room { rows: sheet, stack, starts, turned };
     let visits = &visits[..group.len()];
-    let job = Job { volume, tile: in_frame(tile, perm), axis: a, visits };
+    let job = Job { volume, tile: in_frame(tile, perm), axis: a, visits, wanted };
     let [forward, backward] = hits;
     if visits.iter().all(|visit| visit.reach <= u8::MAX as usize) {
-        run::<K, u8, S>(level, &job, [bytes_of(forward), bytes_of(backward)], &mut room, sink);
+        run::<K, u8, S>(level, &job, [bytes_of(forward), bytes_of(backward)], &mut room, sink)
     } else {
-        run::<K, u32, S>(level, &job, [forward, backward], &mut room, sink);
+        run::<K, u32, S>(level, &job, [forward, backward], &mut room, sink)
     }
 }
 
@@ -147,6 +151,7 @@ struct Job<'a, K> {
     axis: usize,
     /// They share the axis and the displacement along the other axis across it.
     visits: &'a [Visit<'a>],
+    wanted: Option<Wanted<'a>>,
 }
 
 /// Parts of [`Buffers`] that the search needs.
@@ -175,8 +180,15 @@ fn span(shift: &[i32]) -> (i64, i64) {
     (a.min(b), a.max(b))
 }
 
-fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2], room: &mut Room<K>, sink: &mut S) {
-    let Job { volume, tile, axis, visits } = job;
+fn run<K: Key, H: Hit, S: Sink>(
+    level: Level,
+    job: &Job<K>,
+    hits: [&mut [H]; 2],
+    room: &mut Room<K>,
+    sink: &mut S,
+) -> LineCounts {
+    let Job { volume, tile, axis, visits, wanted } = job;
+    let mut counts = LineCounts::default();
     let (a, b) = (*axis, 1 - *axis);
     let origin = volume.region.lo[a];
     let whole = (tile.lo[a] - origin) as usize..(tile.hi[a] - origin) as usize;
@@ -197,26 +209,49 @@ fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2],
                 if planes.is_empty() {
                     continue;
                 }
-                let strip = Strip { axis: a, planes, start: [s_b, s_c], tile };
+                let mut strip = Strip { axis: a, planes, start: [s_b, s_c], tile };
+                let mut spans = spans(&shift_c[strip.planes.clone()], s_c, tile);
+                let asked = |spans: &Spans| spans.iter().filter(|[from, end]| from < end).count() as u64;
+                let all = asked(&spans);
+                counts.total += all;
+                if let Some(wanted) = wanted {
+                    let (live, planes) = wanted.look(visit, &strip);
+                    if planes.is_empty() {
+                        counts.masked += all;
+                        continue;
+                    }
+                    strip.planes = planes;
+                    spans = self::spans(&shift_c[strip.planes.clone()], s_c, tile);
+                    for (lane, span) in spans.iter_mut().enumerate() {
+                        *span = if live >> lane & 1 == 0 { [0, 0] } else { *span };
+                    }
+                    counts.masked += all - asked(&spans);
+                }
                 if i == 0 {
                     sink.expect(visit, &strip);
                 }
-                sheet(level, volume, visit, &strip, [&mut *forward, &mut *backward], room, sink);
+                let busy = sheet(level, volume, visit, &strip, &spans, [&mut *forward, &mut *backward], room, sink);
+                let searched =
+                    spans.iter().enumerate().filter(|(lane, [from, end])| from < end && busy >> lane & 1 == 0);
+                counts.open += searched.count() as u64;
             }
         }
     }
+    counts
 }
 
-/// Searches the lines of one strip and hands the answers on.
+/// Searches the lines of one strip, hands the answers on, and returns the lanes that could have been occluded.
+#[allow(clippy::too_many_arguments)]
 fn sheet<K: Key, H: Hit, S: Sink>(
     level: Level,
     volume: &Volume<K>,
     visit: &Visit,
     strip: &Strip,
+    spans: &Spans,
     hits: [&mut [H]; 2],
     room: &mut Room<K>,
     sink: &mut S,
-) {
+) -> u64 {
     let [shift_b, shift_c] = visit.shifts;
     let Range { start, end } = strip.planes;
     let first = start.saturating_sub(visit.reach);
@@ -230,12 +265,11 @@ fn sheet<K: Key, H: Hit, S: Sink>(
             answers[way] = &mut hits[..count];
         }
     }
-    let spans = spans(&shift_c[start..end], strip.start[1], strip.tile);
     let asked = answers.each_mut().map(|a| &mut **a);
-    scan::both(
+    let busy = scan::both(
         level,
         sheet,
-        &spans,
+        spans,
         start - first..end - first,
         visit.reach,
         asked,
@@ -245,6 +279,7 @@ fn sheet<K: Key, H: Hit, S: Sink>(
     );
     let [forward, backward] = answers;
     sink.add(visit, strip, forward, backward);
+    busy
 }
 
 /// The planes of each lane that lie inside the tile.

@@ -7,7 +7,8 @@
 //! | `driver` | tiles, sheets, senses |
 //! | `column`, `stream` | sweeps of boxes whose halos do not fit into memory |
 //! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide` and `turn`: by AVX-512 |
-//! | `sinks`, `contribute` | what is summed |
+//! | `sinks`, `contribute`, `weighted` | what is summed |
+//! | `wanted` | which lines are searched |
 //! | `room` | how scratch is cut up |
 //! | `shared` | what another device needs |
 //! | `reference` | all of it by the definition |
@@ -30,6 +31,8 @@ mod stream;
 mod tests;
 #[cfg(target_arch = "x86_64")]
 mod turn;
+mod wanted;
+mod weighted;
 #[cfg(target_arch = "x86_64")]
 mod wide;
 
@@ -41,10 +44,13 @@ use crate::with_view;
 use driver::{Buffers, FRAMES, in_frame};
 use keys::{Coded, Key, Volume};
 use room::{Sizes, carve, carve_all};
-use sinks::{OpenSum, Sink, WeightedSum};
+use sinks::{OpenSum, Sink};
+use wanted::Wanted;
+use weighted::WeightedSum;
 
 pub use lines::{is_valid_count, rho};
 pub use stream::Fetch;
+pub use wanted::LineCounts;
 
 /// Parameters with units resolved.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,6 +78,8 @@ pub struct Prepared {
     families: Vec<lines::Family>,
     /// Sum of contributions where nothing occludes.
     total: u64,
+    /// Sum of weights, in units of the weighted sums.
+    uniform: i64,
 }
 
 /// What a sweep reads besides densities, and writes.
@@ -83,6 +91,9 @@ pub struct ObscuranceIo<'a> {
     /// `weight_by_normal`: directions weigh max(0, n.w), n pointing toward the open side. Uniform where it is zero or not
     /// finite. Where no direction of the set has a positive weight, the voxel is open.
     pub normal: Option<[View<'a, f32>; 3]>,
+    /// Voxels of the output box that are asked for: 0 is not, and its outputs are left alone or filled with anything. Lines
+    /// without one that is are not searched.
+    pub needed: Option<View<'a, u8>>,
     /// f32, the output box.
     pub openness: Option<AnyViewMut<'a>>,
     /// f32, the output box. Asks for `colour`.
@@ -110,7 +121,8 @@ impl Prepared {
         assert!(params.max_distance >= 0.0, "max_distance {}", params.max_distance);
         let (mut families, total) = lines::families(params);
         driver::sort(&mut families);
-        Prepared { params: params.clone(), families, total }
+        let uniform = weighted::uniform(&families);
+        Prepared { params: params.clone(), families, total, uniform }
     }
 
     /// Halo in voxels per axis.
@@ -123,19 +135,32 @@ impl Prepared {
     ///
     /// Within 1e-6 of the formula; the bits do not depend on the boxes, nor on the level of the CPU.
     /// Panics if an extent does not fit its box, an output is not f32, or `rgb` comes without `colour`.
-    pub fn sweep(&self, src: AnyView, src_box: Region, dst_box: Region, io: ObscuranceIo, cx: &mut Context) {
+    pub fn sweep(
+        &self,
+        src: AnyView,
+        src_box: Region,
+        dst_box: Region,
+        io: ObscuranceIo,
+        cx: &mut Context,
+    ) -> LineCounts {
         assert_eq!(src.shape(), src_box.shape(), "src must cover its box");
         assert!(src_box.contains(&dst_box), "{src_box:?} must contain {dst_box:?}");
         if dst_box.is_empty() {
-            return;
+            return LineCounts::default();
         }
-        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx));
+        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx))
     }
 
-    /// Bytes of scratch that [`Self::sweep`] takes at most.
+    /// Bytes of scratch that [`Self::sweep`] takes at most, apart from [`Self::masked_bytes`].
     pub fn scratch_bytes(&self, dtype: DType, src: Shape, dst: Shape, colour: bool, normal: bool) -> usize {
         let key = dtype.size();
         self.sizes(src, dst, colour || normal).bytes(key, colour, normal)
+    }
+
+    /// Bytes of scratch that a sweep takes besides where only some voxels are needed.
+    pub fn masked_bytes(&self, dst: Shape) -> usize {
+        let turned = self.families.iter().any(|f| f.axis == 2);
+        if turned { tile_of(dst, false).iter().product::<usize>().next_multiple_of(64) } else { 0 }
     }
 
     fn sizes(&self, src: Shape, dst: Shape, weighted: bool) -> Sizes {
@@ -160,10 +185,12 @@ impl Prepared {
         dst_box: Region,
         io: ObscuranceIo,
         cx: &mut Context,
-    ) {
+    ) -> LineCounts {
         let weighted = io.rgb.is_some() || io.normal.is_some();
         let sizes = self.sizes(src_box.shape(), dst_box.shape(), weighted);
-        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()));
+        let mask = io.needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
+        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()) + mask);
+        let (mask, bytes) = carve::<u8>(bytes, mask);
         let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
         let (buffers, bytes) = sizes.buffers::<T::Key>(bytes);
@@ -192,6 +219,8 @@ impl Prepared {
             src_box,
             dst_box,
             buffers,
+            mask,
+            counts: LineCounts::default(),
         };
         // NaN where a voxel of the row that starts at `p` is missing.
         let gone = |p: [i64; 3], row: &mut [f32]| {
@@ -199,6 +228,7 @@ impl Prepared {
             mark_missing(&src.row_at(z, y)[x..], missing, row);
         };
         pass.tiles(io, bytes, &gone);
+        pass.counts
     }
 }
 
@@ -212,6 +242,9 @@ struct Pass<'a, K> {
     src_box: Region,
     dst_box: Region,
     buffers: Buffers<'a, K>,
+    /// For the needed voxels of a tile with x and z exchanged.
+    mask: &'a mut [u8],
+    counts: LineCounts,
 }
 
 /// Padded copies of the source in the order of each frame. A sweep of one tile needs one after the other, in one place.
@@ -236,16 +269,23 @@ impl<K> Keys<'_, K> {
 
 impl<K: Key> Pass<'_, K> {
     fn tiles(&mut self, io: ObscuranceIo, bytes: &mut [u8], gone: &dyn Fn([i64; 3], &mut [f32])) {
-        let ObscuranceIo { colour, normal, openness, rgb } = io;
+        let ObscuranceIo { colour, normal, needed, openness, rgb } = io;
         let mut openness = openness.map(f32_view);
         let mut rgb = rgb.map(|views| views.map(f32_view));
         assert!(rgb.is_none() || colour.is_some(), "rgb needs colours");
+        let alike = |c: [View<f32>; 3]| c.iter().all(|v| (v.plane, v.row) == (c[0].plane, c[0].row));
+        assert!(colour.is_none_or(alike), "colours lie alike");
         let fast = openness.is_some() && normal.is_none();
         let weighted = rgb.is_some() || normal.is_some();
         let dst_box = self.dst_box;
         let extents = tile_of(dst_box.shape(), weighted);
         for cell in dst_box.cells(dst_box.lo, extents).iter() {
             let tile = Region::of_cell(cell, dst_box.lo, extents).clip(&dst_box);
+            let tile = needed.map_or(tile, |mask| wanted::shrink(tile, mask, dst_box));
+            if tile.is_empty() {
+                continue;
+            }
+            let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
             let voxels = tile.voxels();
             let len = |frame: usize| if fast { sinks::sums_len(tile.shape(), FRAMES[frame]) } else { 0 };
             let (natural, rest) = carve::<u32>(&mut *bytes, len(0));
@@ -256,13 +296,15 @@ impl<K: Key> Pass<'_, K> {
             fast_sum.clear();
             let [weights, open, red, green, blue] = wide;
             let mut wide_sum = WeightedSum {
+                level: self.level,
                 tile,
                 dst_box,
                 src_box: self.src_box,
                 normal,
                 flipped: self.prepared.params.flipped,
-                weights,
-                open,
+                uniform: self.prepared.uniform,
+                weights: if normal.is_some() { weights } else { &mut [] },
+                open: if fast { &mut [] } else { open },
                 ambient: self.prepared.params.ambient,
                 colour: colour.filter(|_| rgb.is_some()),
                 rgb: [red, green, blue],
@@ -270,11 +312,11 @@ impl<K: Key> Pass<'_, K> {
             wide_sum.clear();
             match (fast, weighted) {
                 (true, false) if self.flat => {}
-                (true, false) => self.sweep_tile(tile, &mut fast_sum),
-                (false, true) => self.sweep_tile(tile, &mut wide_sum),
+                (true, false) => self.sweep_tile(tile, needed, &mut fast_sum),
+                (false, true) => self.sweep_tile(tile, needed, &mut wide_sum),
                 (true, true) => {
                     let mut both = (fast_sum, wide_sum);
-                    self.sweep_tile(tile, &mut both);
+                    self.sweep_tile(tile, needed, &mut both);
                     (fast_sum, wide_sum) = both;
                 }
                 (false, false) => return,
@@ -308,12 +350,16 @@ impl<K: Key> Pass<'_, K> {
         }
     }
 
-    fn sweep_tile<S: Sink>(&mut self, tile: Region, sink: &mut S) {
+    fn sweep_tile<S: Sink>(&mut self, tile: Region, needed: Option<View<u8>>, sink: &mut S) {
+        let Pass { mask, counts, .. } = self;
+        let turned = needed.filter(|_| !mask.is_empty()).map(|needed| Wanted::turned(needed, mask));
+        let wanted = [needed.map(Wanted::natural), turned];
         for group in driver::groups(&self.prepared.families) {
             let frame = driver::frame_of(&group[0]);
             let volume = Volume::new(self.keys.in_frame(frame), in_frame(self.src_box, FRAMES[frame]));
             let most = if self.flat { 0 } else { usize::MAX };
-            driver::sweep_group(self.level, group, most, volume, tile, &mut self.buffers, sink);
+            *counts +=
+                driver::sweep_group(self.level, group, most, volume, tile, wanted[frame], &mut self.buffers, sink);
         }
     }
 }

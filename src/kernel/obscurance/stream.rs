@@ -6,6 +6,7 @@ use super::driver::{self, FRAMES};
 use super::keys::{self, Coded, Key};
 use super::room::{Sizes, carve};
 use super::sinks::{self, OpenSum};
+use super::wanted::{self, LineCounts, Wanted};
 use super::{Prepared, f32_view, mark_missing, tile_of};
 use crate::brick::scratch::{cut, padded};
 use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
@@ -15,29 +16,39 @@ use crate::with_view;
 /// Fills a view with the voxels of a box of the source.
 pub type Fetch<'a, E> = &'a mut dyn FnMut(Region, AnyViewMut) -> Result<(), E>;
 
+/// What a streamed sweep found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Streamed {
+    /// Nothing in reach is greater than any voxel.
+    pub flat: bool,
+    pub lines: LineCounts,
+}
+
 impl Prepared {
     /// [`Prepared::sweep`] of openness without weights per voxel, for a source that is fetched box by box: `src` covers
-    /// the output box alone. The bits are the same. True if nothing in reach is greater than any voxel.
+    /// the output box alone. The bits are the same.
     ///
     /// Panics if an extent does not fit its box, or the output is not f32.
     ///
     /// # Errors
     /// The first of `fetch`.
+    #[allow(clippy::too_many_arguments)]
     pub fn sweep_streamed<E>(
         &self,
         src: AnyView,
         dst_box: Region,
         volume: Region,
+        needed: Option<View<u8>>,
         openness: AnyViewMut,
         fetch: Fetch<E>,
         cx: &mut Context,
-    ) -> Result<bool, E> {
+    ) -> Result<Streamed, E> {
         assert_eq!(src.shape(), dst_box.shape(), "src must cover the output box");
         assert!(volume.contains(&dst_box), "{volume:?} must contain {dst_box:?}");
         if dst_box.is_empty() {
-            return Ok(true);
+            return Ok(Streamed { flat: true, lines: LineCounts::default() });
         }
-        with_view!(AnyView, src, v => self.stream_typed(v, dst_box, volume, f32_view(openness), fetch, cx))
+        with_view!(AnyView, src, v => self.stream_typed(v, dst_box, volume, needed, f32_view(openness), fetch, cx))
     }
 
     /// Bytes of scratch that [`Prepared::sweep_streamed`] takes at most.
@@ -72,17 +83,21 @@ impl Prepared {
         (sizes, slab)
     }
 
+    #[allow(clippy::too_many_arguments)]
     fn stream_typed<T: Coded, E>(
         &self,
         src: View<T>,
         dst_box: Region,
         volume: Region,
+        needed: Option<View<u8>>,
         mut openness: ViewMut<f32>,
         fetch: Fetch<E>,
         cx: &mut Context,
-    ) -> Result<bool, E> {
+    ) -> Result<Streamed, E> {
         let (sizes, slab) = self.streamed_sizes(volume.shape(), dst_box.shape());
-        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), false, false) + padded::<T>(slab));
+        let mask = needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
+        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), false, false) + padded::<T>(slab) + mask);
+        let (mask, bytes) = carve::<u8>(bytes, mask);
         let (keys, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (slab, bytes) = cut::<T>(bytes, slab);
         let (mut buffers, bytes) = sizes.buffers::<T::Key>(bytes);
@@ -92,9 +107,16 @@ impl Prepared {
         let missing = keys::missing_of::<T>(self.params.missing);
         let code = keys::Code { missing, flipped: self.params.flipped };
         let extents = tile_of(dst_box.shape(), false);
-        let mut flat = true;
+        let (mut flat, mut lines) = (true, LineCounts::default());
         for cell in dst_box.cells(dst_box.lo, extents).iter() {
             let tile = Region::of_cell(cell, dst_box.lo, extents).clip(&dst_box);
+            let tile = needed.map_or(tile, |mask| wanted::shrink(tile, mask, dst_box));
+            if tile.is_empty() {
+                continue;
+            }
+            let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
+            let turned_mask = needed.filter(|_| !mask.is_empty()).map(|needed| Wanted::turned(needed, mask));
+            let wanted = [needed.map(Wanted::natural), turned_mask];
             let own = src.part(dst_box.offset_of(&tile), tile.shape());
             let least = keys::least(cx.level, own, code);
             let mut sums = OpenSum { level: cx.level, sums: [&mut *natural, &mut *turned], tile };
@@ -114,7 +136,9 @@ impl Prepared {
                     continue;
                 }
                 swept = true;
-                driver::sweep_group(cx.level, group, usize::MAX, column.volume(keys), tile, &mut buffers, &mut sums);
+                let (volume, wanted) = (column.volume(keys), wanted[driver::frame_of(&group[0])]);
+                lines +=
+                    driver::sweep_group(cx.level, group, usize::MAX, volume, tile, wanted, &mut buffers, &mut sums);
             }
             if swept {
                 sums.merge();
@@ -128,6 +152,6 @@ impl Prepared {
                 mark_missing(&own.row_at(z, y)[..nx], missing, row);
             }
         }
-        Ok(flat)
+        Ok(Streamed { flat, lines })
     }
 }

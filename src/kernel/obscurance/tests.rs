@@ -7,6 +7,7 @@ use crate::brick::Scratch;
 use crate::grid::Voxel;
 use crate::stage::directions;
 
+mod masked;
 mod streamed;
 
 fn params() -> ObscuranceParams {
@@ -69,6 +70,7 @@ where
     let io = ObscuranceIo {
         colour: colours.as_ref().map(|c| [0, 1, 2].map(|k| View::dense(&c[k], src_box.shape()))),
         normal: normals.as_ref().map(|c| [0, 1, 2].map(|k| View::dense(&c[k], shape))),
+        needed: None,
         openness: Some(AnyViewMut::F32(ViewMut::dense(&mut openness, shape))),
         rgb: colour.is_some().then(|| rgb.each_mut().map(|v| AnyViewMut::F32(ViewMut::dense(v, shape)))),
     };

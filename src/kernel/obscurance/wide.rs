@@ -28,7 +28,7 @@ pub(super) fn scratch_bytes(planes: usize, queries: usize, size: usize) -> usize
     lines + tables + answers
 }
 
-/// Answers of both senses; see [`super::scan::both`]. An empty slice of hits is a sense that is not asked for.
+/// Answers of both senses and the lanes in which there can be any; see [`super::scan::both`]. An empty slice of hits is a sense that is not asked for.
 /// Panics if `reach` is beyond [`MAX_REACH`] or the scratch is shorter than [`scratch_bytes`].
 ///
 /// # Safety
@@ -41,7 +41,7 @@ pub(super) unsafe fn next_greater<K: Key>(
     reach: usize,
     hits: [&mut [u8]; 2],
     scratch: &mut [u8],
-) {
+) -> u64 {
     let planes = sheet.planes.len();
     assert!(reach <= MAX_REACH && queries.end <= planes);
     assert!(scratch.len() >= scratch_bytes(planes, queries.len(), size_of::<K>()));
@@ -321,14 +321,14 @@ macro_rules! search {
             reach: usize,
             hits: [&mut [u8]; 2],
             scratch: &mut [u8],
-        ) {
+        ) -> u64 {
             /// Keys of a register, and of a block of a line.
             const R: usize = 64 / size_of::<$t>();
             // SAFETY: the caller's promise.
             let busy = unsafe { $busy(data, starts, queries.clone()) };
             if busy == 0 || reach == 0 {
                 hits.into_iter().for_each(|hits| hits.fill(reach as u8));
-                return;
+                return if reach == 0 { 0 } else { busy };
             }
             let planes = starts.len();
             // Blocks are counted so that the first query starts one.
@@ -370,6 +370,9 @@ macro_rules! search {
             for line in 0..LANES {
                 let [from, end] = spans[line].map(|query| (query as usize).min(queries.len()));
                 if from >= end {
+                    for answers in [&mut *answers_f, &mut *answers_b] {
+                        answers[line * answer_stride..][..answer_stride].fill(reach as u8);
+                    }
                     continue;
                 }
                 let asked = from / R..end.div_ceil(R);
@@ -401,6 +404,7 @@ macro_rules! search {
                     unsafe { turn_back(answers.as_ptr(), answer_stride, queries.len(), hits) };
                 }
             }
+            busy
         }
     };
 }

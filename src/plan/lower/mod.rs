@@ -293,5 +293,4 @@ impl Lowering<'_> {
     fn lattice(&self, wire: WireId) -> &Lattice {
         &self.out.graph.lattices[self.out.graph.wires[wire].lattice]
     }
-
 }

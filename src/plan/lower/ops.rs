@@ -1,8 +1,8 @@
 //! Stages that make more than one step, or share one.
 
-use super::Lowering;
 use super::super::graph::*;
 use super::super::{Prepass, PrepassKind, lengths};
+use super::Lowering;
 use crate::config::{ObscuranceOp, Ref, StageNode};
 use crate::grid::Border;
 use crate::kernel::obscurance;

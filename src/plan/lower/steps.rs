@@ -1,8 +1,8 @@
 //! Steps, their wires, masks and pre-passes, and whether the shapes of what they read agree.
 
-use super::Lowering;
 use super::super::graph::*;
 use super::super::{Prepass, PrepassKind};
+use super::Lowering;
 use crate::config::{Op, StageNode, Where, WhereRule};
 use crate::grid::{Affine, Border, DType};
 use crate::kernel::mask;
@@ -78,8 +78,17 @@ impl Lowering<'_> {
                 ));
             }
         }
-        let step =
-            Step { stages: vec![node.name.clone()], kind, inputs, outputs: vec![], reach, border, mask, halo: [0; 3], streamed: false };
+        let step = Step {
+            stages: vec![node.name.clone()],
+            kind,
+            inputs,
+            outputs: vec![],
+            reach,
+            border,
+            mask,
+            halo: [0; 3],
+            streamed: false,
+        };
         self.out.graph.steps.push(step);
         Ok(self.out.graph.steps.len() - 1)
     }

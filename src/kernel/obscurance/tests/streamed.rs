@@ -3,14 +3,21 @@
 use super::*;
 
 /// The streamed sweep of `out`; every box that it fetches must lie in the volume, and no more is read than was said.
-fn streamed<T: Coded>(level: Level, p: &ObscuranceParams, field: &Field<T>, out: Region) -> Vec<f32>
+pub(super) fn streamed<T: Coded>(
+    level: Level,
+    p: &ObscuranceParams,
+    field: &Field<T>,
+    out: Region,
+    needed: Option<&[u8]>,
+) -> Vec<f32>
 where
     for<'a> AnyView<'a>: From<View<'a, T>>,
 {
     let prepared = Prepared::new(p);
     let own: Vec<T> = out.iter().map(|q| field.data[field.index(q).unwrap()]).collect();
     let mut openness = vec![-1f32; out.voxels()];
-    let asked = prepared.streamed_bytes(T::DTYPE, field.region.shape(), out.shape());
+    let asked = prepared.streamed_bytes(T::DTYPE, field.region.shape(), out.shape())
+        + needed.map_or(0, |_| prepared.masked_bytes(out.shape()));
     let mut scratch = Scratch::new();
     // What is left over from before must not matter.
     scratch.take(asked).fill(0xff);
@@ -31,9 +38,14 @@ where
     let view = AnyView::from(View::dense(&own, out.shape()));
     let dst = AnyViewMut::F32(ViewMut::dense(&mut openness, out.shape()));
     let mut cx = Context { level, scratch: &mut scratch };
-    prepared.sweep_streamed(view, out, field.region, dst, &mut fetch, &mut cx).unwrap();
+    let needed = needed.map(|n| View::dense(n, out.shape()));
+    let done = prepared.sweep_streamed(view, out, field.region, needed, dst, &mut fetch, &mut cx).unwrap();
+    assert!(done.flat || done.lines.total > 0);
     assert!(scratch.bytes() <= asked.next_multiple_of(64), "{} bytes taken, {asked} promised", scratch.bytes());
-    assert_eq!(read, prepared.streamed_voxels(out, field.region));
+    match needed {
+        None => assert_eq!(read, prepared.streamed_voxels(out, field.region)),
+        Some(_) => assert!(read <= prepared.streamed_voxels(out, field.region)),
+    }
     openness
 }
 
@@ -62,7 +74,12 @@ where
                     continue;
                 }
                 let want = sweep_part(level, &p, &field, out, None, None).openness;
-                assert_eq!(bits(&streamed(level, &p, &field, out)), bits(&want), "{} {out:?} {level:?}", T::DTYPE);
+                assert_eq!(
+                    bits(&streamed(level, &p, &field, out, None)),
+                    bits(&want),
+                    "{} {out:?} {level:?}",
+                    T::DTYPE
+                );
             }
         }
     }
@@ -85,7 +102,7 @@ fn columns_of_long_reach_and_many_tiles_give_the_same_bits() {
     let p = ObscuranceParams { max_distance: 256.0, ..params() };
     for out in [region, Region::new([2, 100, 5], [5, 290, 17])] {
         let want = sweep_part(Level::detect(), &p, &field, out, None, None).openness;
-        assert_eq!(bits(&streamed(Level::detect(), &p, &field, out)), bits(&want), "{out:?}");
+        assert_eq!(bits(&streamed(Level::detect(), &p, &field, out, None)), bits(&want), "{out:?}");
     }
 }
 
@@ -103,6 +120,9 @@ fn a_failed_fetch_ends_the_sweep() {
         left -= 1;
         if left == 0 { Err("gone") } else { Ok(()) }
     };
-    assert_eq!(Prepared::new(&params()).sweep_streamed(view, region, region, dst, &mut fetch, &mut cx), Err::<bool, _>("gone"));
+    assert_eq!(
+        Prepared::new(&params()).sweep_streamed(view, region, region, None, dst, &mut fetch, &mut cx),
+        Err("gone")
+    );
     assert_eq!(left, 0);
 }
