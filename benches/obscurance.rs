@@ -170,6 +170,7 @@ fn weights() {
     let data: Vec<u8> = field("ct", shape).iter().map(|v| (v * 256.0) as u8).collect();
     let floats: Vec<f32> = data.iter().map(|v| *v as f32).collect();
     let three = [0; 3].map(|_| View::dense(&floats, shape));
+    let colours: Vec<[f32; 4]> = floats.iter().map(|&v| [v; 4]).collect();
     let prepared = Prepared::new(&params());
     let mut scratch = Scratch::new();
     for (name, weigh, bleed) in
@@ -182,7 +183,7 @@ fn weights() {
                 let [openness, r, g, b] = &mut results;
                 let view = |v| AnyViewMut::F32(ViewMut::dense(v, shape));
                 let io = ObscuranceIo {
-                    colour: bleed.then_some(three),
+                    colour: bleed.then(|| View::dense(&colours[..], shape)),
                     normal: weigh.then_some(three),
                     needed: None,
                     openness: Some(view(openness)),

@@ -87,7 +87,7 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
                 return (sweep.streamed_bytes(dtype, volume, dst) + narrowed(dst, wide) + masked(step, dst)) as u64;
             }
             sweep.scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
-                + narrowed(src, colour.is_some())
+                + narrowed(src, colour.is_some()) / 3 * 4
                 + narrowed(dst, normal.is_some())
                 + narrowed(dst, wide)
         }

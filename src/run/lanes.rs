@@ -27,8 +27,8 @@ impl<'a> Engine<'a> {
     ) -> Result<()> {
         let src_box = region.grow(sweep.reach()).clip(&volume);
         // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
-        let colour = has_colour.then(|| std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(inputs[1].view(c, src_box))));
-        let colour = colour.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], src_box.shape())));
+        let colour = has_colour.then(|| interleave([0, 1, 2].map(|c| inputs[1].view(c, src_box))));
+        let colour = colour.as_ref().map(|c| View::dense(&c[..], src_box.shape()));
         let normal = has_normal.then(|| {
             let value = inputs[1 + usize::from(has_colour)];
             std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
@@ -128,6 +128,19 @@ impl<'a> Engine<'a> {
         let step = &self.plan.graph.steps[id];
         Error::Failed(format!("{} on the GPU: {error}; --resume continues", step.stages.join("+")))
     }
+}
+
+/// Three components side by side.
+fn interleave(views: [AnyView; 3]) -> Vec<[f32; 4]> {
+    fn run<T: Voxel>(v: View<T>, c: usize, out: &mut [[f32; 4]]) {
+        let rows = (0..v.shape[0]).flat_map(|z| (0..v.shape[1]).map(move |y| v.row_at(z, y)));
+        out.iter_mut().zip(rows.flatten()).for_each(|(out, x)| out[c] = x.to_f64() as f32);
+    }
+    let mut out = vec![[0.0; 4]; views[0].shape().iter().product()];
+    for (c, view) in views.into_iter().enumerate() {
+        crate::with_view!(AnyView, view, v => run(v, c, &mut out));
+    }
+    out
 }
 
 fn narrow(view: AnyView) -> Vec<f32> {

@@ -11,7 +11,7 @@ use super::keys::{Key, LANES, Volume};
 use super::lines::{Family, displacement};
 use super::scan::{self, Hit, Sheet, Spans};
 use super::sinks::{Sink, Strip, Visit};
-use super::wanted::{LineCounts, Wanted};
+use super::wanted::{self, LineCounts, Look, Wanted};
 use crate::grid::Region;
 use crate::kernel::simd::Level;
 
@@ -214,23 +214,20 @@ fn run<K: Key, H: Hit, S: Sink>(
                 let asked = |spans: &Spans| spans.iter().filter(|[from, end]| from < end).count() as u64;
                 let all = asked(&spans);
                 counts.total += all;
-                if let Some(wanted) = wanted {
-                    let (live, planes) = wanted.look(visit, &strip);
-                    if planes.is_empty() {
-                        counts.masked += all;
+                let look = wanted.as_ref().map(|wanted| wanted.look(visit, &strip));
+                if let Some(look) = &look {
+                    counts.masked += all - look.live.count_ones() as u64;
+                    if look.live == 0 {
                         continue;
                     }
-                    strip.planes = planes;
-                    spans = self::spans(&shift_c[strip.planes.clone()], s_c, tile);
-                    for (lane, span) in spans.iter_mut().enumerate() {
-                        *span = if live >> lane & 1 == 0 { [0, 0] } else { *span };
-                    }
-                    counts.masked += all - asked(&spans);
+                    (strip.planes, spans) = (look.planes.clone(), look.spans);
                 }
                 if i == 0 {
                     sink.expect(visit, &strip);
                 }
-                let busy = sheet(level, volume, visit, &strip, &spans, [&mut *forward, &mut *backward], room, sink);
+                let sparse = look.as_ref().filter(|look| look.is_sparse(visit.reach));
+                let busy =
+                    sheet(level, volume, visit, &strip, &spans, sparse, [&mut *forward, &mut *backward], room, sink);
                 let searched =
                     spans.iter().enumerate().filter(|(lane, [from, end])| from < end && busy >> lane & 1 == 0);
                 counts.open += searched.count() as u64;
@@ -248,6 +245,7 @@ fn sheet<K: Key, H: Hit, S: Sink>(
     visit: &Visit,
     strip: &Strip,
     spans: &Spans,
+    sparse: Option<&Look>,
     hits: [&mut [H]; 2],
     room: &mut Room<K>,
     sink: &mut S,
@@ -266,17 +264,14 @@ fn sheet<K: Key, H: Hit, S: Sink>(
         }
     }
     let asked = answers.each_mut().map(|a| &mut **a);
-    let busy = scan::both(
-        level,
-        sheet,
-        spans,
-        start - first..end - first,
-        visit.reach,
-        asked,
-        room.rows,
-        room.stack,
-        room.turned,
-    );
+    let queries = start - first..end - first;
+    let busy = match sparse {
+        Some(look) => {
+            wanted::walk(sheet, look.rows(), queries, visit.reach, asked);
+            u64::MAX
+        }
+        None => scan::both(level, sheet, spans, queries, visit.reach, asked, room.rows, room.stack, room.turned),
+    };
     let [forward, backward] = answers;
     sink.add(visit, strip, forward, backward);
     busy

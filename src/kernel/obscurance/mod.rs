@@ -43,7 +43,7 @@ use crate::stage::{DirectionSet, DirectionWeights, Rho};
 use crate::with_view;
 use driver::{Buffers, FRAMES, in_frame};
 use keys::{Coded, Key, Volume};
-use room::{Sizes, carve, carve_all};
+use room::{Sizes, carve};
 use sinks::{OpenSum, Sink};
 use wanted::Wanted;
 use weighted::WeightedSum;
@@ -84,9 +84,9 @@ pub struct Prepared {
 
 /// What a sweep reads besides densities, and writes.
 pub struct ObscuranceIo<'a> {
-    /// Colour of each voxel of `src` (linear r, g, b), for colour bleeding. NaN counts as 0, and everything is cut off
-    /// at +-2^18.
-    pub colour: Option<[View<'a, f32>; 3]>,
+    /// Colour of each voxel of `src` (linear r, g, b, and a number that is not looked at: an occluder's colour is one read),
+    /// for colour bleeding. NaN counts as 0, and everything is cut off at +-2^18.
+    pub colour: Option<View<'a, [f32; 4]>>,
     /// Components along z, y, x of the physical gradient of the *stored* values on the *output* box, for
     /// `weight_by_normal`: directions weigh max(0, n.w), n pointing toward the open side. Uniform where it is zero or not
     /// finite. Where no direction of the set has a positive weight, the voxel is open.
@@ -105,8 +105,8 @@ pub struct ObscuranceIo<'a> {
 /// in one tile 0.76 ns per voxel and direction, `[128, 256, 256]` in two tiles 1.08. A sweep of one tile keeps one copy of
 /// the keys, so that 256^3 takes the bytes of two tiles of half the size.
 const TILE: Shape = [256; 3];
-/// The same for sums of 64 bits, which take five times as much.
-const WEIGHTED_TILE: Shape = [256, 128, 256];
+/// The same for sums of 64 bits, of which there are up to five.
+const WEIGHTED_TILE: Shape = [128, 128, 256];
 
 /// Extents of a tile of an output box.
 fn tile_of(dst: Shape, weighted: bool) -> Shape {
@@ -159,8 +159,14 @@ impl Prepared {
 
     /// Bytes of scratch that a sweep takes besides where only some voxels are needed.
     pub fn masked_bytes(&self, dst: Shape) -> usize {
+        8 * self.mask_words(dst).iter().map(|words| words.next_multiple_of(8)).sum::<usize>()
+    }
+
+    /// Words of the bits of a tile's needed voxels, in both frames.
+    fn mask_words(&self, dst: Shape) -> [usize; 2] {
+        let tile = tile_of(dst, false);
         let turned = self.families.iter().any(|f| f.axis == 2);
-        if turned { tile_of(dst, false).iter().product::<usize>().next_multiple_of(64) } else { 0 }
+        [wanted::words_of(tile), if turned { wanted::words_of(FRAMES[1].map(|a| tile[a])) } else { 0 }]
     }
 
     fn sizes(&self, src: Shape, dst: Shape, weighted: bool) -> Sizes {
@@ -171,7 +177,6 @@ impl Prepared {
         Sizes {
             keys: if tile == dst { [copies[0].max(copies[1]), 0] } else { copies },
             sums: FRAMES.map(|frame| sinks::sums_len(tile, frame)),
-            tile: tile.iter().product(),
             sheet: self.families.iter().map(planes).max().unwrap_or(0),
             queries: tile.into_iter().max().unwrap_or(0),
             extent: src.into_iter().max().unwrap_or(0),
@@ -188,9 +193,11 @@ impl Prepared {
     ) -> LineCounts {
         let weighted = io.rgb.is_some() || io.normal.is_some();
         let sizes = self.sizes(src_box.shape(), dst_box.shape(), weighted);
+        let words = io.needed.map_or([0; 2], |_| self.mask_words(dst_box.shape()));
         let mask = io.needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
         let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()) + mask);
-        let (mask, bytes) = carve::<u8>(bytes, mask);
+        let (natural_mask, bytes) = carve::<u64>(bytes, words[0]);
+        let (turned_mask, bytes) = carve::<u64>(bytes, words[1]);
         let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
         let (buffers, bytes) = sizes.buffers::<T::Key>(bytes);
@@ -219,7 +226,7 @@ impl Prepared {
             src_box,
             dst_box,
             buffers,
-            mask,
+            masks: [natural_mask, turned_mask],
             counts: LineCounts::default(),
         };
         // NaN where a voxel of the row that starts at `p` is missing.
@@ -242,8 +249,8 @@ struct Pass<'a, K> {
     src_box: Region,
     dst_box: Region,
     buffers: Buffers<'a, K>,
-    /// For the needed voxels of a tile with x and z exchanged.
-    mask: &'a mut [u8],
+    /// For the needed voxels of a tile in both frames.
+    masks: [&'a mut [u64]; 2],
     counts: LineCounts,
 }
 
@@ -273,8 +280,6 @@ impl<K: Key> Pass<'_, K> {
         let mut openness = openness.map(f32_view);
         let mut rgb = rgb.map(|views| views.map(f32_view));
         assert!(rgb.is_none() || colour.is_some(), "rgb needs colours");
-        let alike = |c: [View<f32>; 3]| c.iter().all(|v| (v.plane, v.row) == (c[0].plane, c[0].row));
-        assert!(colour.is_none_or(alike), "colours lie alike");
         let fast = openness.is_some() && normal.is_none();
         let weighted = rgb.is_some() || normal.is_some();
         let dst_box = self.dst_box;
@@ -286,15 +291,19 @@ impl<K: Key> Pass<'_, K> {
                 continue;
             }
             let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
-            let voxels = tile.voxels();
             let len = |frame: usize| if fast { sinks::sums_len(tile.shape(), FRAMES[frame]) } else { 0 };
             let (natural, rest) = carve::<u32>(&mut *bytes, len(0));
             let (turned, rest) = carve::<u32>(rest, len(1));
             let sums = [natural, turned];
-            let (wide, _) = carve_all::<i64, 5>(rest, if weighted { voxels } else { 0 });
+            let lens = FRAMES.map(|frame| sinks::sums_len(tile.shape(), frame));
+            let used = |yes: bool| if yes { lens } else { [0; 2] };
+            let (weights, rest) = weighted::pair(rest, used(normal.is_some()));
+            let (open, rest) = weighted::pair(rest, used(normal.is_some()));
+            let (red, rest) = weighted::pair(rest, used(rgb.is_some()));
+            let (green, rest) = weighted::pair(rest, used(rgb.is_some()));
+            let (blue, _) = weighted::pair(rest, used(rgb.is_some()));
             let mut fast_sum = OpenSum { level: self.level, sums, tile };
             fast_sum.clear();
-            let [weights, open, red, green, blue] = wide;
             let mut wide_sum = WeightedSum {
                 level: self.level,
                 tile,
@@ -303,8 +312,8 @@ impl<K: Key> Pass<'_, K> {
                 normal,
                 flipped: self.prepared.params.flipped,
                 uniform: self.prepared.uniform,
-                weights: if normal.is_some() { weights } else { &mut [] },
-                open: if fast { &mut [] } else { open },
+                weights,
+                open,
                 ambient: self.prepared.params.ambient,
                 colour: colour.filter(|_| rgb.is_some()),
                 rgb: [red, green, blue],
@@ -324,26 +333,24 @@ impl<K: Key> Pass<'_, K> {
             if fast && !self.flat {
                 fast_sum.merge();
             }
+            wide_sum.merge();
             let total = self.prepared.total;
             let [nz, ny, nx] = tile.shape();
             let at = dst_box.offset_of(&tile);
             for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-                let first = (z * ny + y) * nx;
                 let gone = |row: &mut [f32]| gone([tile.lo[0] + z as i64, tile.lo[1] + y as i64, tile.lo[2]], row);
                 if let Some(out) = &mut openness {
                     let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
                     match fast {
                         true if self.flat => row.fill(1.0),
                         true => fast_sum.openness([z, y], 0, total, row),
-                        false => row.iter_mut().zip(first..).for_each(|(out, i)| *out = wide_sum.openness(i)),
+                        false => wide_sum.openness([z, y], row),
                     }
                     gone(row);
                 }
                 for (c, out) in rgb.iter_mut().flatten().enumerate() {
                     let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
-                    for (x, out) in row.iter_mut().enumerate() {
-                        *out = wide_sum.colour_of(first + x, c);
-                    }
+                    wide_sum.colour_of([z, y], c, row);
                     gone(row);
                 }
             }
@@ -351,15 +358,22 @@ impl<K: Key> Pass<'_, K> {
     }
 
     fn sweep_tile<S: Sink>(&mut self, tile: Region, needed: Option<View<u8>>, sink: &mut S) {
-        let Pass { mask, counts, .. } = self;
-        let turned = needed.filter(|_| !mask.is_empty()).map(|needed| Wanted::turned(needed, mask));
-        let wanted = [needed.map(Wanted::natural), turned];
+        let Pass { masks: [natural, turned], counts, .. } = self;
+        let wanted = needed.map(|needed| Wanted::both(needed, natural, turned));
         for group in driver::groups(&self.prepared.families) {
             let frame = driver::frame_of(&group[0]);
             let volume = Volume::new(self.keys.in_frame(frame), in_frame(self.src_box, FRAMES[frame]));
             let most = if self.flat { 0 } else { usize::MAX };
-            *counts +=
-                driver::sweep_group(self.level, group, most, volume, tile, wanted[frame], &mut self.buffers, sink);
+            *counts += driver::sweep_group(
+                self.level,
+                group,
+                most,
+                volume,
+                tile,
+                wanted.map(|w| w[frame]),
+                &mut self.buffers,
+                sink,
+            );
         }
     }
 }

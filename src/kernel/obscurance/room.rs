@@ -9,9 +9,8 @@ use super::wide;
 pub(super) struct Sizes {
     /// Padded copies: natural, and with x and z exchanged, or one in the place of both.
     pub keys: [usize; 2],
-    /// Sums of both frames of a tile, and its voxels.
+    /// Sums of a tile in both frames.
     pub sums: [usize; 2],
-    pub tile: usize,
     /// Planes of a sheet.
     pub sheet: usize,
     /// Planes of a sheet that belong to the tile.
@@ -42,7 +41,8 @@ impl Sizes {
             + (1 + TOGETHER) * line(self.extent * 4)
             + 2 * TOGETHER * line((self.extent + 1) * 4)
             + if normal { 0 } else { line(self.sums[0] * 4) + line(self.sums[1] * 4) }
-            + if normal || colour { 5 * line(self.tile * 8) } else { 0 }
+            + (if normal { 2 } else { 0 } + if colour { 3 } else { 0 })
+                * (line(self.sums[0] * 8) + line(self.sums[1] * 8))
     }
 
     /// Working memory of the driver, off the front of `bytes`.

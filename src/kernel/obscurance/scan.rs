@@ -96,8 +96,7 @@ fn stacked<K: Key, H: Hit>(
     }
 }
 
-/// For each lane the queries that are wanted, from and to, counted from the first; answers of others may be anything, but a
-/// lane without any is open.
+/// For each lane the queries that are wanted, from and to, counted from the first; others are answered, or open.
 pub(super) type Spans = [[u32; 2]; LANES];
 
 /// Planes of 64 keys, where they stand in a padded volume.

@@ -91,7 +91,7 @@ impl<A: Sink, B: Sink> Sink for (A, B) {
 
 /// Row and plane strides of the sums of a tile of extents `n`: sheets cross the planes, which would fall into a few
 /// cache sets if they stood a multiple of a page apart. Grows with the extents.
-fn strides(n: Shape) -> [usize; 2] {
+pub(super) fn strides(n: Shape) -> [usize; 2] {
     let plane = n[1] * n[2];
     [n[2], if plane < 1024 { plane } else { plane.next_multiple_of(1024) + 272 }]
 }
@@ -100,6 +100,30 @@ fn strides(n: Shape) -> [usize; 2] {
 pub(super) fn sums_len(n: Shape, perm: [usize; 3]) -> usize {
     let n = perm.map(|a| n[a]);
     n[0] * strides(n)[1]
+}
+
+/// Adds sums of the exchanged frame of a tile of extents `n` to those in natural order.
+pub(super) fn add_turned<T: Copy + Default + std::ops::AddAssign>(n: Shape, natural: &mut [T], turned: &[T]) {
+    const TILE: usize = 16;
+    let [nz, ny, nx] = n;
+    let ([row, plane], [to_row, to_plane]) = (strides([nx, ny, nz]), strides([nz, ny, nx]));
+    for y in 0..ny {
+        for z0 in (0..nz).step_by(TILE) {
+            for x0 in (0..nx).step_by(TILE) {
+                let (tz, tx) = (TILE.min(nz - z0), TILE.min(nx - x0));
+                let mut part = [[T::default(); TILE]; TILE];
+                for (x, part) in part[..tx].iter_mut().enumerate() {
+                    part[..tz].copy_from_slice(&turned[(x0 + x) * plane + y * row + z0..][..tz]);
+                }
+                for z in 0..tz {
+                    let to = &mut natural[(z0 + z) * to_plane + y * to_row + x0..][..tx];
+                    for (to, part) in to.iter_mut().zip(&part) {
+                        *to += part[z];
+                    }
+                }
+            }
+        }
+    }
 }
 
 /// Openness with weights that depend on the direction only. One buffer for each frame, each in the frame's order.
@@ -117,27 +141,8 @@ impl OpenSum<'_> {
 
     /// Adds the sums of the exchanged frame to those in natural order.
     pub fn merge(&mut self) {
-        const TILE: usize = 16;
-        let [nz, ny, nx] = self.tile.shape();
         let [natural, turned] = &mut self.sums;
-        let ([row, plane], [to_row, to_plane]) = (strides([nx, ny, nz]), strides([nz, ny, nx]));
-        for y in 0..ny {
-            for z0 in (0..nz).step_by(TILE) {
-                for x0 in (0..nx).step_by(TILE) {
-                    let (tz, tx) = (TILE.min(nz - z0), TILE.min(nx - x0));
-                    let mut part = [[0; TILE]; TILE];
-                    for (x, part) in part[..tx].iter_mut().enumerate() {
-                        part[..tz].copy_from_slice(&turned[(x0 + x) * plane + y * row + z0..][..tz]);
-                    }
-                    for z in 0..tz {
-                        let to = &mut natural[(z0 + z) * to_plane + y * to_row + x0..][..tx];
-                        for (to, part) in to.iter_mut().zip(&part) {
-                            *to += part[z];
-                        }
-                    }
-                }
-            }
-        }
+        add_turned(self.tile.shape(), natural, turned);
     }
 
     /// Openness of row `[z, y]` of the tile, after [`Self::merge`]; `total` is the sum where nothing occludes, and `open` what

@@ -75,7 +75,6 @@ impl Prepared {
         let sizes = Sizes {
             keys: [keys, 0],
             sums: FRAMES.map(|frame| sinks::sums_len(tile, frame)),
-            tile: 0,
             sheet: planes,
             queries: tile.into_iter().max().unwrap_or(0),
             extent: planes,
@@ -95,9 +94,11 @@ impl Prepared {
         cx: &mut Context,
     ) -> Result<Streamed, E> {
         let (sizes, slab) = self.streamed_sizes(volume.shape(), dst_box.shape());
+        let words = needed.map_or([0; 2], |_| self.mask_words(dst_box.shape()));
         let mask = needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
         let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), false, false) + padded::<T>(slab) + mask);
-        let (mask, bytes) = carve::<u8>(bytes, mask);
+        let (natural_mask, bytes) = carve::<u64>(bytes, words[0]);
+        let (turned_mask, bytes) = carve::<u64>(bytes, words[1]);
         let (keys, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (slab, bytes) = cut::<T>(bytes, slab);
         let (mut buffers, bytes) = sizes.buffers::<T::Key>(bytes);
@@ -115,8 +116,7 @@ impl Prepared {
                 continue;
             }
             let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
-            let turned_mask = needed.filter(|_| !mask.is_empty()).map(|needed| Wanted::turned(needed, mask));
-            let wanted = [needed.map(Wanted::natural), turned_mask];
+            let wanted = needed.map(|needed| Wanted::both(needed, natural_mask, turned_mask));
             let own = src.part(dst_box.offset_of(&tile), tile.shape());
             let least = keys::least(cx.level, own, code);
             let mut sums = OpenSum { level: cx.level, sums: [&mut *natural, &mut *turned], tile };
@@ -136,7 +136,7 @@ impl Prepared {
                     continue;
                 }
                 swept = true;
-                let (volume, wanted) = (column.volume(keys), wanted[driver::frame_of(&group[0])]);
+                let (volume, wanted) = (column.volume(keys), wanted.map(|w| w[driver::frame_of(&group[0])]));
                 lines +=
                     driver::sweep_group(cx.level, group, usize::MAX, volume, tile, wanted, &mut buffers, &mut sums);
             }

@@ -1,9 +1,11 @@
 //! Sums with weights per voxel and direction, and of colours: a piece of a row at once, in arrays of lanes.
 
+use super::contribute;
 use super::keys::LANES;
 use super::lines::Family;
+use super::room::carve;
 use super::scan::Hit;
-use super::sinks::{Sink, Strip, Visit};
+use super::sinks::{Sink, Strip, Visit, add_turned, strides};
 use crate::grid::{Region, View};
 use crate::kernel::simd::Level;
 use crate::multiversion;
@@ -27,7 +29,7 @@ pub(super) fn uniform(families: &[Family]) -> i64 {
     families.iter().flat_map(|f| f.senses.iter().flatten()).map(|sense| fixed(sense.weight)).sum()
 }
 
-/// Openness or colour with weights per voxel and direction. Sums are in the natural order of the tile.
+/// Openness or colour with weights per voxel and direction. Sums of each frame are in its order.
 pub(super) struct WeightedSum<'a> {
     pub level: Level,
     /// The output tile, and the whole output box that `normal` covers.
@@ -39,42 +41,60 @@ pub(super) struct WeightedSum<'a> {
     pub flipped: bool,
     /// Sum of all directions' weights, which is that of every voxel where there is no normal.
     pub uniform: i64,
-    /// Empty without normals.
-    pub weights: &'a mut [i64],
-    /// Sums of openness; empty where it is summed elsewhere.
-    pub open: &'a mut [i64],
+    /// Empty without normals, as are those of openness.
+    pub weights: [&'a mut [i64]; 2],
+    pub open: [&'a mut [i64]; 2],
     /// Colour on the source box, if it is wanted.
-    pub colour: Option<[View<'a, f32>; 3]>,
+    pub colour: Option<View<'a, [f32; 4]>>,
     /// Colour of the open.
     pub ambient: [f64; 3],
     /// Sums of colour.
-    pub rgb: [&'a mut [i64]; 3],
+    pub rgb: [[&'a mut [i64]; 2]; 3],
 }
 
-impl WeightedSum<'_> {
+/// Sums of both frames.
+pub(super) fn pair(bytes: &mut [u8], [natural, turned]: [usize; 2]) -> ([&mut [i64]; 2], &mut [u8]) {
+    let (natural, bytes) = carve(bytes, natural);
+    let (turned, bytes) = carve(bytes, turned);
+    ([natural, turned], bytes)
+}
+
+impl<'a> WeightedSum<'a> {
+    fn all(&mut self) -> impl Iterator<Item = &mut [&'a mut [i64]; 2]> {
+        [&mut self.weights, &mut self.open].into_iter().chain(&mut self.rgb)
+    }
+
     pub fn clear(&mut self) {
-        self.weights.fill(0);
-        self.open.fill(0);
-        self.rgb.iter_mut().for_each(|s| s.fill(0));
+        self.all().flatten().for_each(|s| s.fill(0));
     }
 
-    fn weight(&self, i: usize) -> i64 {
-        self.weights.get(i).copied().unwrap_or(self.uniform)
-    }
-
-    /// Openness of voxel `i` of the tile.
-    pub fn openness(&self, i: usize) -> f32 {
-        match self.weight(i) {
-            0 => 1.0,
-            weight => (self.open[i] as f64 / weight as f64) as f32,
+    /// Adds the sums of the exchanged frame to those in natural order.
+    pub fn merge(&mut self) {
+        let n = self.tile.shape();
+        for [natural, turned] in self.all().filter(|s| !s[0].is_empty()) {
+            add_turned(n, natural, turned);
         }
     }
 
-    /// Component `c` of the colour of voxel `i` of the tile.
-    pub fn colour_of(&self, i: usize, c: usize) -> f32 {
-        match self.weight(i) {
-            0 => self.ambient[c] as f32,
-            weight => (self.rgb[c][i] as f64 / weight as f64) as f32,
+    /// Sums and weights of a row of the tile; without normals all weights are one number.
+    fn row<'r>(&'r self, sums: &'r [i64], [z, y]: [usize; 2]) -> impl Iterator<Item = (i64, i64)> + use<'r, 'a> {
+        let [row, plane] = strides(self.tile.shape());
+        let first = z * plane + y * row;
+        let weight = move |i: usize| self.weights[0].get(first + i).copied().unwrap_or(self.uniform);
+        sums[first..].iter().enumerate().map(move |(i, &sum)| (sum, weight(i)))
+    }
+
+    /// Openness of row `[z, y]` of the tile, after [`Self::merge`].
+    pub fn openness(&self, at: [usize; 2], out: &mut [f32]) {
+        for (out, (sum, weight)) in out.iter_mut().zip(self.row(self.open[0], at)) {
+            *out = if weight == 0 { 1.0 } else { (sum as f64 / weight as f64) as f32 };
+        }
+    }
+
+    /// Component `c` of the colour of row `[z, y]` of the tile, after [`Self::merge`].
+    pub fn colour_of(&self, at: [usize; 2], c: usize, out: &mut [f32]) {
+        for (out, (sum, weight)) in out.iter_mut().zip(self.row(self.rgb[c][0], at)) {
+            *out = if weight == 0 { self.ambient[c] as f32 } else { (sum as f64 / weight as f64) as f32 };
         }
     }
 }
@@ -106,10 +126,8 @@ fn add_pieces<H: Hit>(sum: &mut WeightedSum, visit: &Visit, strip: &Strip, forwa
             Some(normal) => normals(normal, sum.dst_box, p, last, n, sum.flipped),
             None => [[0.0; LANES]; 3],
         };
-        let extents = sum.tile.shape();
-        let at: [usize; 3] = std::array::from_fn(|a| (p[a] - sum.tile.lo[a]) as usize);
-        let first = (at[0] * extents[1] + at[1]) * extents[2] + at[2];
-        let stride = if last == 2 { 1 } else { extents[1] * extents[2] };
+        let frame = usize::from(last == 0);
+        let first = contribute::start(strides(visit.perm.map(|a| sum.tile.shape()[a])), strip, &piece);
         for (way, answers) in [forward, backward].into_iter().enumerate() {
             let (Some(sense), false) = (&visit.family.senses[way], answers.is_empty()) else { continue };
             let answers = &answers[piece.answers.clone()];
@@ -129,32 +147,28 @@ fn add_pieces<H: Hit>(sum: &mut WeightedSum, visit: &Visit, strip: &Strip, forwa
                 *seen *= if steps >= visit.reach { 1.0 } else { visit.family.rho[steps] };
             }
             if sum.normal.is_some() {
-                spread(sum.weights, &weights, first, stride, n);
-            }
-            if !sum.open.is_empty() {
-                spread(sum.open, &seen, first, stride, n);
+                spread(sum.weights[frame], &weights, first, n);
+                spread(sum.open[frame], &seen, first, n);
             }
             if let Some(colour) = &sum.colour {
                 let colours = colours(colour, sum.ambient, sum.src_box, visit, way, strip.axis, p, answers);
                 for (rgb, colour) in sum.rgb.iter_mut().zip(&colours) {
                     let mut light = seen;
                     light.iter_mut().zip(colour).for_each(|(light, c)| *light *= c);
-                    spread(rgb, &light, first, stride, n);
+                    spread(rgb[frame], &light, first, n);
                 }
             }
         }
     }
 }
 
-/// Adds `n` lanes to sums that stand `stride` apart.
+/// Adds `n` lanes to sums.
 #[inline(always)]
-fn spread(sums: &mut [i64], lanes: &Lanes, first: usize, stride: usize, n: usize) {
-    let mut values = [0; LANES];
-    values.iter_mut().zip(lanes).for_each(|(v, l)| *v = fixed(*l));
-    if stride == 1 {
-        sums[first..first + n].iter_mut().zip(&values).for_each(|(sum, v)| *sum += v);
-    } else {
-        sums[first..].iter_mut().step_by(stride).zip(&values[..n]).for_each(|(sum, v)| *sum += v);
+fn spread(sums: &mut [i64], lanes: &Lanes, first: usize, n: usize) {
+    let sums = &mut sums[first..first + n];
+    match <&mut [i64; LANES]>::try_from(&mut *sums) {
+        Ok(sums) => sums.iter_mut().zip(lanes).for_each(|(sum, l)| *sum += fixed(*l)),
+        Err(_) => sums.iter_mut().zip(lanes).for_each(|(sum, l)| *sum += fixed(*l)),
     }
 }
 
@@ -189,7 +203,7 @@ fn normals(normal: &[View<f32>; 3], of: Region, p: [i64; 3], last: usize, n: usi
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 fn colours<H: Hit>(
-    colour: &[View<f32>; 3],
+    colour: &View<[f32; 4]>,
     ambient: [f64; 3],
     src_box: Region,
     visit: &Visit,
@@ -199,7 +213,7 @@ fn colours<H: Hit>(
     answers: &[H],
 ) -> [Lanes; 3] {
     let [a, b, c] = [visit.perm[axis], visit.perm[1 - axis], visit.perm[2]];
-    let strides = [colour[0].plane, colour[0].row, 1].map(|s| s as i64);
+    let strides = [colour.plane, colour.row, 1].map(|s| s as i64);
     let from: i64 = (0..3).map(|x| (p[x] - src_box.lo[x]) * strides[x]).sum();
     let plane = (p[a] - visit.origin) as usize;
     let [shift_b, shift_c] = visit.shifts;
@@ -214,7 +228,8 @@ fn colours<H: Hit>(
         let to = (plane as i64 + j) as usize;
         let moved = [shift_b[to] - home[0], shift_c[to] - home[1]].map(|d| d as i64);
         let at = from + j * strides[a] + moved[0] * strides[b] + (lane as i64 + moved[1]) * strides[c];
-        (0..3).for_each(|k| out[k][lane] = colour[k].data[at as usize] as f64);
+        let seen = colour.data[at as usize];
+        (0..3).for_each(|k| out[k][lane] = seen[k] as f64);
     }
     for lanes in &mut out {
         for v in lanes {

@@ -380,6 +380,11 @@ macro_rules! search {
                     true => answers[line * answer_stride..][..answer_stride].as_mut_ptr(),
                     false => std::ptr::null_mut(),
                 };
+                let unasked = [0..asked.start * R, (asked.end * R).min(answer_stride)..answer_stride];
+                for answers in [&mut *answers_f, &mut *answers_b] {
+                    let line = &mut answers[line * answer_stride..][..answer_stride];
+                    unasked.iter().for_each(|part| line[part.clone()].fill(reach as u8));
+                }
                 let answers = [place(0, answers_f), place(1, answers_b)];
                 if busy >> line & 1 == 0 {
                     for to in answers.into_iter().filter(|to| !to.is_null()) {

@@ -36,14 +36,14 @@ fn skipped_lines_never_show() {
         let prepared = Prepared::new(&p);
         let src = out.grow(prepared.reach()).clip(&region);
         let voxels: Vec<u8> = src.iter().map(|q| data[Field { data: &data, region }.index(q).unwrap()]).collect();
-        let colours = [0, 1, 2].map(|c| part(&colour[c], src));
+        let colours = interleave(&[0, 1, 2].map(|c| part(&colour[c], src)));
         let normals = [0, 1, 2].map(|c| part(&gradient[c], out));
         let sweep = |level: Level, needed: Option<&[u8]>| {
             let mut results = [0, 1, 2, 3].map(|_| vec![-1f32; out.voxels()]);
             let [openness, r, g, b] = &mut results;
             let view = |v| AnyViewMut::F32(ViewMut::dense(v, out.shape()));
             let io = ObscuranceIo {
-                colour: bleed.then(|| [0, 1, 2].map(|c| View::dense(&colours[c], src.shape()))),
+                colour: bleed.then(|| View::dense(&colours[..], src.shape())),
                 normal: weigh.then(|| [0, 1, 2].map(|c| View::dense(&normals[c], out.shape()))),
                 needed: needed.map(|n| View::dense(n, out.shape())),
                 openness: Some(view(openness)),
