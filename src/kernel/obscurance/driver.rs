@@ -209,7 +209,7 @@ fn run<K: Key, H: Hit, S: Sink>(
                 if planes.is_empty() {
                     continue;
                 }
-                let mut strip = Strip { axis: a, planes, start: [s_b, s_c], tile };
+                let mut strip = Strip { axis: a, planes, start: [s_b, s_c], tile, rows: &[] };
                 let mut spans = spans(&shift_c[strip.planes.clone()], s_c, tile);
                 let asked = |spans: &Spans| spans.iter().filter(|[from, end]| from < end).count() as u64;
                 let all = asked(&spans);
@@ -221,6 +221,7 @@ fn run<K: Key, H: Hit, S: Sink>(
                         continue;
                     }
                     (strip.planes, spans) = (look.planes.clone(), look.spans);
+                    strip.rows = look.rows();
                 }
                 if i == 0 {
                     sink.expect(visit, &strip);

@@ -41,7 +41,7 @@ pub(super) fn brute<K: Key>(
 }
 
 macro_rules! brute {
-    ($name:ident, $feature:literal, $t:ty, $v:ty, $load:ident, $store:ident, $zero:expr, $and:ident, $sub:ident,
+    ($name:ident, $feature:literal, $t:ty, $v:ty, $load:ident, $store:ident, $zero:expr, $and:ident, $or:ident, $sub:ident,
      $some:expr, $le:expr) => {
         /// # Safety
         /// `planes` rows of 64 keys from `rows` on; `queries` among them; the CPU has the feature.
@@ -56,8 +56,11 @@ macro_rules! brute {
             hits: &mut [u8],
         ) {
             const R: usize = size_of::<$v>() / size_of::<$t>();
-            let mut on = [0 as $t; LANES];
-            on.iter_mut().enumerate().for_each(|(lane, on)| *on = if live >> lane & 1 == 0 { 0 } else { <$t>::MAX });
+            let (mut on, mut off) = ([0 as $t; LANES], [0 as $t; LANES]);
+            for (lane, (on, off)) in on.iter_mut().zip(&mut off).enumerate() {
+                *on = if live >> lane & 1 == 0 { 0 } else { <$t>::MAX };
+                *off = !*on;
+            }
             for (query, hits) in queries.zip(hits.chunks_exact_mut(LANES)) {
                 let steps = reach.min(if ahead { planes - 1 - query } else { query });
                 let stride = if ahead { LANES as isize } else { -(LANES as isize) };
@@ -87,10 +90,12 @@ macro_rules! brute {
                     // SAFETY: arrays of the size of a vector.
                     unsafe {
                         $store(counts.as_mut_ptr().cast(), count);
-                        $store(open.as_mut_ptr().cast(), alive);
+                        // Lanes that were never on are open as well.
+                        let off = $load(off.as_ptr().add(lane).cast());
+                        $store(open.as_mut_ptr().cast(), $or(alive, off));
                     }
-                    for (((hit, count), open), on) in hits[lane..].iter_mut().zip(counts).zip(open).zip(&on[lane..]) {
-                        *hit = if open != 0 || *on == 0 { reach as u8 } else { count as u8 };
+                    for ((hit, count), open) in hits[lane..].iter_mut().zip(counts).zip(open) {
+                        *hit = if open != 0 { reach as u8 } else { count as u8 };
                     }
                 }
             }
@@ -107,6 +112,7 @@ brute!(
     _mm256_storeu_si256,
     _mm256_setzero_si256(),
     _mm256_and_si256,
+    _mm256_or_si256,
     _mm256_sub_epi8,
     |v| _mm256_testz_si256(v, v) == 0,
     |r, q| _mm256_cmpeq_epi8(_mm256_max_epu8(r, q), q)
@@ -120,6 +126,7 @@ brute!(
     _mm256_storeu_si256,
     _mm256_setzero_si256(),
     _mm256_and_si256,
+    _mm256_or_si256,
     _mm256_sub_epi16,
     |v| _mm256_testz_si256(v, v) == 0,
     |r, q| _mm256_cmpeq_epi16(_mm256_max_epu16(r, q), q)
@@ -133,6 +140,7 @@ brute!(
     _mm256_storeu_si256,
     _mm256_setzero_si256(),
     _mm256_and_si256,
+    _mm256_or_si256,
     _mm256_sub_epi32,
     |v| _mm256_testz_si256(v, v) == 0,
     |r, q| _mm256_cmpeq_epi32(_mm256_max_epu32(r, q), q)
@@ -146,6 +154,7 @@ brute!(
     _mm_storeu_si128,
     _mm_setzero_si128(),
     _mm_and_si128,
+    _mm_or_si128,
     _mm_sub_epi8,
     |v| _mm_movemask_epi8(v) != 0,
     |r, q| _mm_cmpeq_epi8(_mm_max_epu8(r, q), q)
@@ -159,6 +168,7 @@ brute!(
     _mm_storeu_si128,
     _mm_setzero_si128(),
     _mm_and_si128,
+    _mm_or_si128,
     _mm_sub_epi16,
     |v| _mm_movemask_epi8(v) != 0,
     |r, q| _mm_cmpeq_epi16(_mm_subs_epu16(r, q), _mm_setzero_si128())

@@ -38,6 +38,8 @@ pub(super) struct Strip<'a> {
     pub start: [i64; 2],
     /// The output tile, in frame order.
     pub tile: &'a Region,
+    /// Needed lanes of each plane; empty where all are.
+    pub rows: &'a [u64],
 }
 
 /// A piece of a row of the output tile.
@@ -52,7 +54,7 @@ pub(super) struct Piece {
 }
 
 impl Strip<'_> {
-    /// The pieces of the planes of the strip, without those outside of the tile.
+    /// The pieces of the planes of the strip, without those outside of the tile or without a needed voxel.
     #[inline(always)]
     pub fn pieces(&self, visit: &Visit) -> impl Iterator<Item = Piece> {
         let shifts = visit.shifts.map(|s| &s[self.planes.clone()]);
@@ -64,7 +66,12 @@ impl Strip<'_> {
             let first = row * LANES;
             let answers = first + (from - start) as usize..first + (to - start) as usize;
             let (along, across) = (origin + row as i64, s_b + d_b as i64);
-            (from < to).then_some(Piece { along, across, from, answers })
+            (from < to && self.rows.get(row).is_none_or(|&lanes| lanes != 0)).then_some(Piece {
+                along,
+                across,
+                from,
+                answers,
+            })
         })
     }
 }

@@ -28,7 +28,7 @@ fn skipped_lines_never_show() {
         || -> [Vec<f32>; 3] { [0, 1, 2].map(|_| region.iter().map(|_| noise.unit() as f32 - 0.4).collect()) };
     let (colour, gradient) = (field_of(), field_of());
     let part = |data: &[f32], r: Region| -> Vec<f32> {
-        let field = Field { data: &data[..], region };
+        let field = Field { data, region };
         r.iter().map(|q| data[field.index(q).unwrap()]).collect()
     };
     for (weigh, bleed) in [(false, false), (false, true), (true, true)] {
