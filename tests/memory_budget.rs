@@ -124,7 +124,7 @@ fn a_budget_too_small_for_one_brick_is_refused_with_the_least_that_does() {
     let dir = tempfile::tempdir().unwrap();
     let text = r#"
 [run]
-memory = "30MiB"
+memory = "21MiB"
 threads = 1
 [input.a]
 synthetic = "noise"
