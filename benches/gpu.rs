@@ -252,7 +252,13 @@ fn sweep_on(
         Some(gpu) => gpu.obscurance(sweep, src, whole, whole, &mut view, cx),
         None => {
             let openness = Some(AnyViewMut::F32(view));
-            sweep.sweep(src, whole, whole, ObscuranceIo { colour: None, normal: None, openness, rgb: None }, cx);
+            sweep.sweep(
+                src,
+                whole,
+                whole,
+                ObscuranceIo { colour: None, normal: None, needed: None, openness, rgb: None },
+                cx,
+            );
             Ok(Times::default())
         }
     }

@@ -1,9 +1,9 @@
 //! Speed and accuracy of obscurance sweeps, one thread.
 //!
-//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT | --bricks DISTANCE | --halves]`:
+//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT | --bricks DISTANCE | --halves | --weights | --where]`:
 //! CPU seconds of the best of several sweeps over a cube of 256^3 voxels, by field, element type, reach and instruction set;
 //! with `--accuracy`, errors of direction sets against 6000 directions; with `--bricks`, what halos cost; with `--halves`, two
-//! threads.
+//! threads; with `--weights`, colours and normals; with `--where`, masks.
 
 use occlude::brick::Scratch;
 use occlude::grid::{AnyView, AnyViewMut, Region, Shape, View, ViewMut};
@@ -82,6 +82,7 @@ fn time(level: Level, p: &ObscuranceParams, view: AnyView, runs: usize) -> (f64,
         let io = ObscuranceIo {
             colour: None,
             normal: None,
+            needed: None,
             openness: Some(AnyViewMut::F32(ViewMut::dense(&mut out, shape))),
             rgb: None,
         };
@@ -120,7 +121,7 @@ fn bricks(max_distance: f64) {
         let mut best = f64::INFINITY;
         for _ in 0..2 {
             let openness = Some(AnyViewMut::F32(ViewMut::dense(&mut out, brick)));
-            let io = ObscuranceIo { colour: None, normal: None, openness, rgb: None };
+            let io = ObscuranceIo { colour: None, normal: None, needed: None, openness, rgb: None };
             let start = cpu_seconds();
             let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
             prepared.sweep(AnyView::U8(view), src, dst, io, &mut cx);
@@ -152,13 +153,80 @@ fn halves(edge: usize) {
                     let src = dst.grow(prepared.reach()).clip(&whole);
                     let view = View::dense(data, shape).part(src.lo.map(|v| v as usize), src.shape());
                     let openness = Some(AnyViewMut::F32(ViewMut::dense(out, dst.shape())));
-                    let io = ObscuranceIo { colour: None, normal: None, openness, rgb: None };
+                    let io = ObscuranceIo { colour: None, normal: None, needed: None, openness, rgb: None };
                     let mut cx = Context { level: Level::detect(), scratch };
                     prepared.sweep(AnyView::U8(view), src, dst, io, &mut cx);
                 });
             }
         });
         println!("two threads, a half of {edge}^3 each, dmax 64: {:.3} s", start.elapsed().as_secs_f64());
+    }
+}
+
+/// Openness, colours and normals over 128^3 CT-like voxels.
+fn weights() {
+    let shape = [128; 3];
+    let whole = Region::whole(shape);
+    let data: Vec<u8> = field("ct", shape).iter().map(|v| (v * 256.0) as u8).collect();
+    let floats: Vec<f32> = data.iter().map(|v| *v as f32).collect();
+    let three = [0; 3].map(|_| View::dense(&floats, shape));
+    let colours: Vec<[f32; 4]> = floats.iter().map(|&v| [v; 4]).collect();
+    let prepared = Prepared::new(&params());
+    let mut scratch = Scratch::new();
+    for (name, weigh, bleed) in
+        [("openness", false, false), ("rgb", false, true), ("normals", true, false), ("both", true, true)]
+    {
+        for level in [Level::Baseline, Level::detect()] {
+            let mut results = [0; 4].map(|_| vec![0f32; data.len()]);
+            let mut best = f64::INFINITY;
+            for _ in 0..2 {
+                let [openness, r, g, b] = &mut results;
+                let view = |v| AnyViewMut::F32(ViewMut::dense(v, shape));
+                let io = ObscuranceIo {
+                    colour: bleed.then(|| View::dense(&colours[..], shape)),
+                    normal: weigh.then_some(three),
+                    needed: None,
+                    openness: Some(view(openness)),
+                    rgb: bleed.then(|| [view(r), view(g), view(b)]),
+                };
+                let start = cpu_seconds();
+                let mut cx = Context { level, scratch: &mut scratch };
+                prepared.sweep(AnyView::U8(View::dense(&data, shape)), whole, whole, io, &mut cx);
+                best = best.min(cpu_seconds() - start);
+            }
+            println!("{name:<9} {level:<9?} {:6.2} ns/voxel/direction", best * 1e9 / data.len() as f64 / 42.0);
+        }
+    }
+}
+
+/// Sweeps of 256^3 of which only some voxels are needed.
+fn masks() {
+    let shape = [256; 3];
+    let whole = Region::whole(shape);
+    let data: Vec<u8> = field("ct", shape).iter().map(|v| (v * 256.0) as u8).collect();
+    let distance = |p: [i64; 3]| p.iter().map(|c| (*c as f64 - 128.0).powi(2)).sum::<f64>().sqrt();
+    let prepared = Prepared::new(&params());
+    let mut scratch = Scratch::new();
+    let masks: [(&str, Option<Vec<u8>>); 4] = [
+        ("all", None),
+        ("body", Some(whole.iter().map(|p| u8::from(distance(p) < 110.0)).collect())),
+        ("band of 2", Some(whole.iter().map(|p| u8::from((distance(p) - 95.0).abs() < 2.0)).collect())),
+        ("0.1 %", Some(whole.iter().map(|p| u8::from(hash(p).is_multiple_of(1000))).collect())),
+    ];
+    for (name, mask) in masks {
+        let mut out = vec![0f32; data.len()];
+        let (mut best, mut counts) = (f64::INFINITY, Default::default());
+        for _ in 0..3 {
+            let openness = Some(AnyViewMut::F32(ViewMut::dense(&mut out, shape)));
+            let needed = mask.as_ref().map(|m| View::dense(&m[..], shape));
+            let io = ObscuranceIo { colour: None, normal: None, needed, openness, rgb: None };
+            let start = cpu_seconds();
+            let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+            counts = prepared.sweep(AnyView::U8(View::dense(&data, shape)), whole, whole, io, &mut cx);
+            best = best.min(cpu_seconds() - start);
+        }
+        let needed = mask.map_or(1.0, |m| m.iter().map(|&v| v as f64).sum::<f64>() / m.len() as f64);
+        println!("{name:<10} needed {:5.1} %  {best:6.3} s  {counts:?}", 100.0 * needed);
     }
 }
 
@@ -211,6 +279,7 @@ fn accuracy() {
                 let io = ObscuranceIo {
                     colour: None,
                     normal: None,
+                    needed: None,
                     openness: Some(AnyViewMut::F32(ViewMut::dense(&mut out, shape))),
                     rgb: None,
                 };
@@ -244,6 +313,12 @@ fn main() {
     let after = |key: &str| args.iter().position(|a| a == key).map(|i| &args[i + 1..]);
     if after("--accuracy").is_some() {
         return accuracy();
+    }
+    if after("--weights").is_some() {
+        return weights();
+    }
+    if after("--where").is_some() {
+        return masks();
     }
     if after("--halves").is_some() {
         return halves(256);

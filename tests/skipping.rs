@@ -120,6 +120,28 @@ fn obscurance_keeps_its_channels_apart_from_colours_and_normals() {
 }
 
 #[test]
+fn lines_without_needed_voxels_are_not_searched_and_counted() {
+    let dir = tempfile::tempdir().unwrap();
+    island(dir.path());
+    let text = "[run]\ndevice = 'cpu'\n[input.a]\npath = 'vol.npy'\n[stage.s]\nop = 'obscurance'\ninput = 'a'\ndirections = 12\n\
+                max_distance = 20\nwhere = { input = 'a', iso = [1], band = 2.0 }\n[output.o]\npath = 'o.zarr'\nfrom = 's'\n\
+                dtype = 'f32'\n";
+    let report = run(dir.path(), text, &[]);
+    let lines = &report.stages[0].lines;
+    assert!(lines["where"] > 0, "{lines:?}");
+    assert!(lines["where"] + lines["open"] < lines["total"], "{lines:?}");
+    let skipped = decode(&dir.path().join("o.zarr"));
+    let config = parse(dir.path(), text, &[]);
+    let plain = occlude::run::RunOptions { overwrite: true, no_skip: true, ..Default::default() };
+    let report = run_with(&config, &plain);
+    assert_eq!(report.stages[0].lines["where"], 0);
+    assert_same("with and without skipping", &skipped, &decode(&dir.path().join("o.zarr")));
+    // A mask that leaves a stage that sweeps without one alone.
+    let unmasked = run(dir.path(), &text.replace("where =", "#"), &[]);
+    assert_eq!(unmasked.stages[0].lines["where"], 0);
+}
+
+#[test]
 fn the_plan_knows_what_will_be_skipped_for_missing_chunks_and_impossible_masks() {
     let dir = tempfile::tempdir().unwrap();
     island(dir.path());

@@ -34,7 +34,13 @@ impl Gpu {
         let job = SweepJob::new(sweep, src.dtype(), src_box, dst_box);
         let Some((job, parts)) = job.and_then(|j| j.parts(self.cap()).map(|p| (j, p))) else {
             let openness = Some(AnyViewMut::F32(openness.reborrow()));
-            sweep.sweep(src, src_box, dst_box, ObscuranceIo { colour: None, normal: None, openness, rgb: None }, cx);
+            sweep.sweep(
+                src,
+                src_box,
+                dst_box,
+                ObscuranceIo { colour: None, normal: None, needed: None, openness, rgb: None },
+                cx,
+            );
             return Ok(Times::default());
         };
         self.attempt(|device| {

@@ -2,6 +2,7 @@
 
 use super::Plan;
 use super::memory::{self, brick_bytes, parked_bytes};
+use super::streams;
 use super::tasks::{Group, input_halo};
 use crate::config::Config;
 use crate::grid::Shape;
@@ -38,8 +39,8 @@ impl BrickChoice {
     }
 }
 
-/// Chooses the brick of a group, or refuses with the least budget that would do.
-pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<BrickChoice> {
+/// Chooses the brick of a group and says its relative time per voxel, or refuses with the least budget that would do.
+pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<(BrickChoice, f64)> {
     if let Some(asked) = config.run.brick {
         let shape = round_up(asked.map(|n| n.max(1)), group.align, group.task);
         let why = if shape == asked {
@@ -50,7 +51,9 @@ pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<BrickChoice
                 group.align, group.task
             )
         };
-        return fit(plan, group, shape, why).ok_or_else(|| refuse(plan, group, shape, config));
+        let choice = fit(plan, group, shape, why).ok_or_else(|| refuse(plan, group, shape, config))?;
+        let cost = cost(plan, group, shape, &choice);
+        return Ok((choice, cost));
     }
     let mut best: Option<(f64, BrickChoice)> = None;
     for shape in candidates(group) {
@@ -61,12 +64,12 @@ pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<BrickChoice
         }
     }
     match best {
-        Some((_, mut choice)) => {
+        Some((cost, mut choice)) => {
             choice.why = format!(
                 "least work per voxel of the shapes whose {} bricks in flight fit: reads {:.2} input voxels per output voxel",
                 choice.in_flight, choice.amplification
             );
-            Ok(choice)
+            Ok((choice, cost))
         }
         None => Err(refuse(plan, group, least(group), config)),
     }
@@ -149,7 +152,10 @@ fn amplification(plan: &Plan, group: &Group, shape: Shape) -> f64 {
             })
             .product::<f64>()
     };
-    inputs.iter().map(|&w| one(w)).sum::<f64>() / inputs.len().max(1) as f64
+    let mean = inputs.iter().map(|&w| one(w)).sum::<f64>() / inputs.len().max(1) as f64;
+    let streamed = group.steps.iter().filter(|&&s| plan.graph.steps[s].streamed);
+    let fetched: usize = streamed.map(|&s| streams::fetched(plan, s, shape, group.shape)).sum();
+    mean + fetched as f64 / shape.iter().product::<usize>() as f64
 }
 
 /// Relative time per voxel: work on halos, short rows, idle cores at the end, too few bricks in flight.
@@ -161,20 +167,35 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     // and the last one's writing.
     let rounds = ((bricks / threads).ceil() * threads + 0.5 * threads) / bricks;
     let short_rows = 1.0 + 24.0 / shape[2].min(region[2]) as f64;
-    let starved = if choice.in_flight > plan.workers { 1.0 } else { 1.5 + threads / choice.in_flight as f64 };
+    let starved = match choice.in_flight {
+        // Workers read for themselves.
+        n if streams::any(plan, group) => threads / (n as f64).min(threads),
+        n if n > plan.workers => 1.0,
+        n => 1.5 + threads / n as f64,
+    };
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels; beyond, the pipeline only gets coarser.
     let large = 1.0 + (shape.iter().product::<usize>() as f64 / 16e6).powi(2) * 0.1;
     let partial_chunks =
         if (0..3).any(|a| !shape[a].is_multiple_of(group.chunk[a]) && shape[a] < region[a]) { 1.15 } else { 1.0 };
     let overhead = 1.0 + 20_000.0 / shape.iter().product::<usize>() as f64;
-    choice.amplification.powf(0.8) * rounds * short_rows * starved * large * partial_chunks * overhead
+    streams::work(plan, group, choice.amplification) * rounds * short_rows * starved * large * partial_chunks * overhead
 }
 
-fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
+/// Bytes of one brick with its scratch, and of a run of such bricks one by one.
+fn one_brick(plan: &Plan, group: &Group, shape: Shape) -> [u64; 2] {
     let bytes = brick_bytes(plan, group, shape) + memory::scratch_bytes(plan, group, shape);
     let mut probe = group.clone();
     probe.brick.shape = shape;
-    let need = bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.workers as u64;
+    [bytes, bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.workers as u64]
+}
+
+/// The least budget that would do for a group.
+pub fn least_bytes(plan: &Plan, group: &Group) -> u64 {
+    one_brick(plan, group, least(group))[1]
+}
+
+fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
+    let [bytes, need] = one_brick(plan, group, shape);
     config.locate(Error::config(
         "run.memory",
         format!(

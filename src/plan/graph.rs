@@ -85,6 +85,15 @@ pub struct Step {
     pub mask: Option<Mask>,
     /// Voxels beyond the brick that the step computes: the largest of its outputs'.
     pub halo: [usize; 3],
+    /// The first input is read box by box while the step runs, instead of with its reach; see [`super::streams`].
+    pub streamed: bool,
+}
+
+impl Step {
+    /// The wire that is read box by box while the step runs.
+    pub fn fetched(&self) -> Option<WireId> {
+        self.streamed.then(|| self.inputs[0])
+    }
 }
 
 /// What a step computes; `channel` lists go with [`Step::outputs`].
@@ -206,6 +215,8 @@ pub struct Graph {
 impl Graph {
     /// Demands halos from consumers to producers: a wire's halo is the largest of its consumers' plus their reach.
     pub fn demand_halos(&mut self) {
+        self.wires.iter_mut().for_each(|w| w.halo = [0; 3]);
+        self.steps.iter_mut().for_each(|s| s.halo = [0; 3]);
         for s in (0..self.steps.len()).rev() {
             let outputs = self.steps[s].outputs.clone();
             let mut halo = self.steps[s].halo;
@@ -219,8 +230,9 @@ impl Graph {
                 StepKind::Obscurance { normal, .. } => *normal,
                 _ => None,
             };
+            let fetched = self.steps[s].fetched();
             for w in self.steps[s].inputs.clone() {
-                let need = if Some(w) == point { halo } else { add3(halo, reach) };
+                let need = if Some(w) == point || Some(w) == fetched { halo } else { add3(halo, reach) };
                 self.wires[w].halo = max3(self.wires[w].halo, need);
             }
             if let Some(mask) = &self.steps[s].mask {

@@ -95,15 +95,26 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Obscurance { params, colour, normal, .. } => {
             let sweep = obscurance::Prepared::new(params);
             let wide = dtype.result() == DType::F64;
+            if step.streamed {
+                return (sweep.streamed_bytes(dtype, volume, dst) + narrowed(dst, wide) + masked(step, dst)) as u64;
+            }
             sweep.scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
-                + narrowed(src, colour.is_some())
+                + narrowed(src, colour.is_some()) / 3 * 4
                 + narrowed(dst, normal.is_some())
                 + narrowed(dst, wide)
         }
         _ => 0,
     };
-    let mask = if step.mask.is_some() { dst.iter().product() } else { 0 };
-    (kernel + copy + mask) as u64
+    (kernel + copy + masked(step, dst)) as u64
+}
+
+/// The mask of a step, and what a kernel that skips keeps of it.
+fn masked(step: &Step, dst: Shape) -> usize {
+    let kernel = match &step.kind {
+        StepKind::Obscurance { params, .. } => obscurance::Prepared::new(params).masked_bytes(dst),
+        _ => 0,
+    };
+    if step.mask.is_some() { dst.iter().product::<usize>() + kernel } else { 0 }
 }
 
 /// Windows of f32 that the GPU leaves to the CPU are made in a box of their own, and rows are finished there.

@@ -10,6 +10,7 @@ pub mod lower;
 pub mod memory;
 pub mod outputs;
 pub mod skips;
+pub mod streams;
 pub mod tasks;
 
 use graph::{GlobalId, Graph, StepId, WireId};
@@ -99,11 +100,7 @@ impl Plan {
         if plan.waives_byte_identity() {
             plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
         }
-        plan.groups = tasks::groups(&plan);
-        plan.chains = chains::chains(&plan);
-        for g in 0..plan.groups.len() {
-            plan.groups[g].brick = brick::choose(&plan, &plan.groups[g], config)?;
-        }
+        streams::choose(&mut plan, config)?;
         Ok(plan)
     }
 

@@ -149,6 +149,12 @@ impl Look<'_> {
                 step.inputs.iter().copied().chain(made).for_each(|w| read[w] = true);
             }
         }
+        // What a streamed step reads beyond the box of its input.
+        let beyond = |s: StepId| {
+            let step = &graph.steps[s];
+            let region = of_step(s).grow(step.reach).clip(&volume);
+            step.fetched().is_none_or(|w| self.constant(w, region).is_some())
+        };
         let mut masked = false;
         for &s in &self.group.steps {
             let step = &graph.steps[s];
@@ -158,7 +164,7 @@ impl Look<'_> {
             let within = !matches!(step.border, Border::Constant(_)) || volume.contains(&of_step(s).grow(step.reach));
             match needed(s) {
                 Some(false) => masked = true,
-                Some(true) if within && step.inputs.iter().all(|&w| known[w]) => {}
+                Some(true) if within && beyond(s) && step.inputs.iter().all(|&w| known[w]) => {}
                 _ => return None,
             }
             step.outputs.iter().for_each(|&w| known[w] = true);

@@ -22,13 +22,15 @@ pub struct Future {
     /// Bricks of the stream that read it, or `None` if this is no brick's read: a mask looks at it, and the brick itself may
     /// still read it.
     pub uses: Option<u32>,
-    /// Place in the order of bricks of the next that reads it, after this one.
+    /// Place in the order of bricks of the next that reads it, after this one; of this one where `uses` is `None`.
     pub next: u32,
+    /// Place of the brick that reads it now.
+    pub now: u32,
 }
 
 impl Future {
     /// Nobody knows: kept before all else, and of these the least recently used goes first.
-    pub const UNKNOWN: Future = Future { uses: None, next: 0 };
+    pub const UNKNOWN: Future = Future { uses: None, next: 0, now: 0 };
 }
 
 /// A decoded chunk.
@@ -52,6 +54,19 @@ struct State {
     left: HashMap<Key, u32>,
     bytes: u64,
     clock: u64,
+    /// Furthest place that was read for.
+    front: u32,
+}
+
+/// Bricks that may be read out of order: a chunk kept for a place further behind than this is not waited for any more.
+const BEHIND: u32 = 64;
+
+impl State {
+    /// What a chunk is evicted by, greatest first.
+    fn rank(&self, next: u32) -> u32 {
+        let given_up = next > 0 && next.saturating_add(BEHIND) < self.front;
+        if given_up { u32::MAX } else { next }
+    }
 }
 
 /// Shared by the readers of one stream.
@@ -70,6 +85,7 @@ impl ChunkCache {
     /// One chunk for one brick: from the cache, or decoded once even if several ask.
     pub fn get(&self, source: &Source, key: Key, future: Future, pool: &Pool, metrics: &Metrics) -> Result<Chunk> {
         let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
+        state.front = state.front.max(future.now);
         loop {
             state.clock += 1;
             let now = state.clock;
@@ -112,7 +128,9 @@ impl ChunkCache {
                 .slots
                 .iter()
                 .filter_map(|(k, s)| match s {
-                    Slot::Ready { next, last, bytes, .. } if *bytes > 0 => Some((*next, Reverse(*last), *k)),
+                    Slot::Ready { next, last, bytes, .. } if *bytes > 0 => {
+                        Some((state.rank(*next), Reverse(*last), *k))
+                    }
                     _ => None,
                 })
                 .max();
@@ -214,7 +232,7 @@ impl Uses {
                 }
             }
         }
-        Future { uses: Some(uses.max(1)), next }
+        Future { uses: Some(uses.max(1)), next, now }
     }
 
     /// Chunks that a box touches.

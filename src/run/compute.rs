@@ -1,16 +1,16 @@
 //! Evaluates a program on a loaded brick, step by step, giving buffers back as soon as nobody reads them.
 
+use std::cell::Cell;
 use std::time::Instant;
 
-use super::metrics::Metrics;
 use super::program::Program;
-use super::read::Loaded;
+use super::read::{Loaded, Reader};
 use super::steps::{Engine, MaskValue};
 use super::trace::Trace;
 use super::value::Value;
 use crate::Result;
 use crate::brick::Scratch;
-use crate::grid::Region;
+use crate::grid::{AnyViewMut, Region};
 use crate::plan::graph::{Step, StepId, WireId};
 
 /// A brick whose sinks are made.
@@ -37,15 +37,14 @@ impl Finished {
 ///
 /// # Errors
 /// A GPU that failed twice.
-pub fn evaluate(
-    engine: &Engine,
-    program: &Program,
-    loaded: Loaded,
-    scratch: &mut Scratch,
-    metrics: &Metrics,
-    trace: &Trace,
-) -> Result<Finished> {
+pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &Trace) -> Result<Finished> {
     let Loaded { brick, mut values, mut masks, all_missing } = loaded;
+    let Reader { engine, program, metrics, .. } = *reader;
+    let stored = Cell::new(false);
+    let fetch = |wire: WireId, region: Region, dst: AnyViewMut| {
+        stored.set(reader.fetch(wire, region, dst)? || stored.get());
+        Ok(())
+    };
     let plan = engine.plan;
     let volume = Region::whole(program.volume);
     let off: Vec<StepId> =
@@ -83,7 +82,7 @@ pub fn evaluate(
         let outputs = if off.contains(&s) {
             engine.filled(step, region)
         } else {
-            engine.run(s, &mut values, known, region, volume, scratch)?
+            engine.run(s, &mut values, known, region, volume, &fetch, scratch)?
         };
         if matches!(known, MaskValue::None) {
             masked = true;
@@ -101,7 +100,7 @@ pub fn evaluate(
     match (ran, masked, constant || plain_constant) {
         (true, ..) => metrics.computed(),
         (false, true, _) => metrics.skipped("where"),
-        (false, false, true) if all_missing => metrics.skipped("missing_chunk"),
+        (false, false, true) if all_missing && !stored.get() => metrics.skipped("missing_chunk"),
         (false, false, true) => metrics.skipped("constant"),
         _ => metrics.computed(),
     }

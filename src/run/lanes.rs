@@ -1,7 +1,8 @@
 //! Which device runs a step on a box, and the sweep, whose operands are narrowed first, on either.
 
-use super::steps::{Engine, three, view_mut, views_mut};
-use super::value::Value;
+use super::steps::{Engine, Fetch, MaskValue, three, view_mut, views_mut};
+use super::value::{Value, common_value};
+use crate::brick::Scratch;
 use crate::gpu::chain::Extents;
 use crate::gpu::slopes::Fit;
 use crate::gpu::{Gpu, GpuError};
@@ -23,14 +24,15 @@ impl<'a> Engine<'a> {
         [has_colour, has_normal]: [bool; 2],
         inputs: &[&Value],
         outputs: &mut [Value],
+        mask: &MaskValue,
         region: Region,
         volume: Region,
         cx: &mut Context,
     ) -> Result<()> {
         let src_box = region.grow(sweep.reach()).clip(&volume);
         // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
-        let colour = has_colour.then(|| std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(inputs[1].view(c, src_box))));
-        let colour = colour.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], src_box.shape())));
+        let colour = has_colour.then(|| interleave([0, 1, 2].map(|c| inputs[1].view(c, src_box))));
+        let colour = colour.as_ref().map(|c| View::dense(&c[..], src_box.shape()));
         let normal = has_normal.then(|| {
             let value = inputs[1 + usize::from(has_colour)];
             std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
@@ -43,7 +45,7 @@ impl<'a> Engine<'a> {
             narrow_outputs = outputs.iter().map(|v| self.buffers(DType::F32, region, v.comps.len())).collect();
         }
         let targets = if wide { &mut narrow_outputs[..] } else { &mut *outputs };
-        let mut io = ObscuranceIo { colour, normal, openness: None, rgb: None };
+        let mut io = ObscuranceIo { colour, normal, needed: self.needed(mask, region), openness: None, rgb: None };
         for (channel, value) in channels.iter().zip(targets) {
             let mut views = views_mut(value);
             match channel {
@@ -57,7 +59,7 @@ impl<'a> Engine<'a> {
                 let done = gpu.obscurance(sweep, src, src_box, region, openness, cx);
                 done.map_err(|e| self.gpu_failed(id, &e))?;
             }
-            _ => sweep.sweep(src, src_box, region, io, cx),
+            _ => self.metrics.lines(id, sweep.sweep(src, src_box, region, io, cx)),
         }
         for (from, to) in narrow_outputs.into_iter().zip(outputs) {
             for c in 0..from.comps.len() {
@@ -120,6 +122,53 @@ impl<'a> Engine<'a> {
         Ok(Some(outputs))
     }
 
+    /// The voxels that a mask leaves, for kernels that skip the others.
+    fn needed<'m>(&self, mask: &'m MaskValue, region: Region) -> Option<View<'m, u8>> {
+        match mask {
+            MaskValue::Some(needed) if self.skip => Some(View::dense(needed, region.shape())),
+            _ => None,
+        }
+    }
+
+    /// A sweep that reads the columns of its lines while it runs. A brick in which nothing can be occluded is a constant.
+    #[allow(clippy::too_many_arguments)]
+    pub(super) fn sweep_streamed(
+        &self,
+        id: StepId,
+        inputs: &[&Value],
+        mask: &MaskValue,
+        region: Region,
+        volume: Region,
+        fetch: &Fetch,
+        scratch: &mut Scratch,
+    ) -> Result<Vec<Value>> {
+        let step = &self.plan.graph.steps[id];
+        let wire = &self.plan.graph.wires[step.outputs[0]];
+        let mut openness = self.buffers(DType::F32, region, 1);
+        let mut read = |part: Region, dst: AnyViewMut| fetch(step.inputs[0], part, dst);
+        let src = inputs[0].view(0, region);
+        let mut cx = Context { level: self.level, scratch };
+        let out = view_mut(&mut openness, 0);
+        let needed = self.needed(mask, region);
+        let done = self.sweeps[&id].sweep_streamed(src, region, volume, needed, out, &mut read, &mut cx)?;
+        self.metrics.lines(id, done.lines);
+        if done.flat
+            && self.skip
+            && matches!(mask, MaskValue::All)
+            && let Some(value) = common_value(openness.view(0, region))
+        {
+            openness.recycle(self.pool);
+            return Ok(vec![Value::constant(wire.dtype, region, 1, value)]);
+        }
+        if wire.dtype == DType::F32 {
+            return Ok(vec![openness]);
+        }
+        let mut wide = self.buffers(wire.dtype, region, 1);
+        pointwise::scale(openness.view(0, region), Affine::IDENTITY, None, view_mut(&mut wide, 0));
+        openness.recycle(self.pool);
+        Ok(vec![wide])
+    }
+
     /// The GPU, where it is to run a step on this box: not a single voxel, which stands for a constant brick, and not while
     /// all slots are taken if the step's bricks may go to either lane. The bits are the same.
     pub(super) fn lane(&self, id: StepId, region: Region) -> Option<&'a Gpu> {
@@ -146,6 +195,19 @@ pub(super) fn gradient_out<'v>(channels: &[GradientChannel], outputs: &'v mut [V
             GradientChannel::Magnitude => out.magnitude = views.pop(),
             GradientChannel::Vector => out.vector = Some(three(views)),
         }
+    }
+    out
+}
+
+/// Three components side by side.
+fn interleave(views: [AnyView; 3]) -> Vec<[f32; 4]> {
+    fn run<T: Voxel>(v: View<T>, c: usize, out: &mut [[f32; 4]]) {
+        let rows = (0..v.shape[0]).flat_map(|z| (0..v.shape[1]).map(move |y| v.row_at(z, y)));
+        out.iter_mut().zip(rows.flatten()).for_each(|(out, x)| out[c] = x.to_f64() as f32);
+    }
+    let mut out = vec![[0.0; 4]; views[0].shape().iter().product()];
+    for (c, view) in views.into_iter().enumerate() {
+        crate::with_view!(AnyView, view, v => run(v, c, &mut out));
     }
     out
 }

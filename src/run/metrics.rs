@@ -5,6 +5,8 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
+use crate::kernel::obscurance::LineCounts;
+
 /// Counters that all threads add to.
 #[derive(Debug)]
 pub struct Metrics {
@@ -21,6 +23,8 @@ pub struct Metrics {
     waits: Mutex<BTreeMap<&'static str, f64>>,
     /// Nanoseconds and voxels per step.
     steps: Vec<(AtomicU64, AtomicU64)>,
+    /// Lines of sweeps per step: all, those without a needed voxel, those that nothing can occlude.
+    lines: Vec<[AtomicU64; 3]>,
     /// Bricks per step that the GPU left to the CPU.
     shared: Vec<AtomicU64>,
     /// Nanoseconds of reading, converting with levels, and encoding.
@@ -44,6 +48,7 @@ impl Metrics {
             skipped: Mutex::default(),
             waits: Mutex::default(),
             steps: (0..steps).map(|_| Default::default()).collect(),
+            lines: (0..steps).map(|_| Default::default()).collect(),
             shared: (0..steps).map(|_| Default::default()).collect(),
             read_ns: AtomicU64::default(),
             encode_ns: AtomicU64::default(),
@@ -97,6 +102,21 @@ impl Metrics {
     pub fn step(&self, step: usize, start: Instant, voxels: u64) {
         self.steps[step].0.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
         self.steps[step].1.fetch_add(voxels, Relaxed);
+    }
+
+    /// A sweep of a step looked at these lines.
+    pub fn lines(&self, step: usize, counts: LineCounts) {
+        let [total, masked, open] = &self.lines[step];
+        total.fetch_add(counts.total, Relaxed);
+        masked.fetch_add(counts.masked, Relaxed);
+        open.fetch_add(counts.open, Relaxed);
+    }
+
+    /// Lines of a step by what became of them; empty if it swept none.
+    pub fn line_counts(&self, step: usize) -> BTreeMap<String, u64> {
+        let counts = ["total", "where", "open"].into_iter().zip(&self.lines[step]);
+        let counts: BTreeMap<_, _> = counts.map(|(name, n)| (name.to_string(), n.load(Relaxed))).collect();
+        if counts["total"] > 0 { counts } else { BTreeMap::new() }
     }
 
     /// A CPU worker took a brick of a step on the GPU.

@@ -10,7 +10,8 @@ use super::program::Program;
 use super::steps::{Engine, MaskValue};
 use super::value::{Comp, Value, common_value, copy_into};
 use crate::Result;
-use crate::grid::{Region, Voxel};
+use crate::brick::gather;
+use crate::grid::{AnyViewMut, Region, Voxel};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
 use crate::store::Source;
@@ -25,6 +26,17 @@ pub struct Loaded {
     pub masks: Vec<(StepId, MaskValue)>,
     /// Every input that was read turned out missing from storage.
     pub all_missing: bool,
+}
+
+/// Why a box is read.
+#[derive(Debug, Clone, Copy)]
+enum Why {
+    /// It is the brick's input.
+    Brick,
+    /// A mask looks at it first.
+    Mask,
+    /// So do steps while they run, nobody knows how often.
+    Fetched,
 }
 
 /// Reads for one stream.
@@ -57,7 +69,7 @@ impl Reader<'_> {
             let Producer::Input(input) = plan.graph.wires[mask.wire].producer else { continue };
             let region = self.program.step_box(plan, s, brick);
             let wanted = region.grow(mask.reach).clip(&volume);
-            let (mut value, _) = self.input(input, mask.wire, wanted, place, false)?;
+            let (mut value, _) = self.input(input, mask.wire, wanted, place, Why::Mask)?;
             let known = self.engine.mask(mask, &mut value, region, volume);
             value.recycle(self.engine.pool);
             if matches!(known, MaskValue::None) && self.engine.skip {
@@ -72,7 +84,9 @@ impl Reader<'_> {
             }
             let Producer::Input(input) = plan.graph.wires[wire].producer else { continue };
             let region = wire_box(brick, halo, self.program.volume);
-            let (value, missing) = self.input(input, wire, region, place, true)?;
+            let fetched = self.program.steps.iter().any(|&s| plan.graph.steps[s].fetched() == Some(wire));
+            let why = if fetched { Why::Fetched } else { Why::Brick };
+            let (value, missing) = self.input(input, wire, region, place, why)?;
             self.metrics.gathered(region.voxels() as u64);
             loaded.all_missing &= missing;
             loaded.values[wire] = Some(value);
@@ -82,13 +96,13 @@ impl Reader<'_> {
     }
 
     /// All components of an input over a box, and whether nothing of it is stored.
-    fn input(&self, input: usize, wire: WireId, region: Region, place: u32, counts: bool) -> Result<(Value, bool)> {
+    fn input(&self, input: usize, wire: WireId, region: Region, place: u32, why: Why) -> Result<(Value, bool)> {
         let wire = &self.engine.plan.graph.wires[wire];
         let mut all_missing = true;
         let comps = (0..wire.components)
             .map(|c| {
                 let (comp, missing) = match &self.uses[input] {
-                    Some(uses) => self.chunked(input, c, region, uses, place, counts)?,
+                    Some(uses) => self.chunked(input, c, region, uses, place, why)?,
                     None => (self.plain(input, c, region)?, false),
                 };
                 all_missing &= missing;
@@ -107,6 +121,39 @@ impl Reader<'_> {
         Ok((Value { dtype: wire.dtype, region, comps }, all_missing))
     }
 
+    /// Reads a box of an input with one component; true if something of it is stored.
+    pub fn fetch(&self, wire: WireId, region: Region, mut dst: AnyViewMut) -> Result<bool> {
+        let start = Instant::now();
+        let Producer::Input(input) = self.engine.plan.graph.wires[wire].producer else {
+            unreachable!("steps fetch inputs")
+        };
+        let source = &self.sources[input];
+        let mut stored = false;
+        match &self.uses[input] {
+            None => {
+                self.metrics.bytes_read(source.read_again(0, region, dst)?);
+                stored = true;
+            }
+            Some(uses) => {
+                let shape = source.info().chunk.expect("a chunked source");
+                for index in uses.chunks(region).iter() {
+                    let key = (input, 0, index);
+                    let chunk_box = Region::of_cell(index, [0; 3], shape);
+                    match self.cache.get(source, key, Future::UNKNOWN, self.engine.pool, self.metrics)? {
+                        Chunk::Missing(value) => fill_box(dst.reborrow(), region, chunk_box, value),
+                        Chunk::Decoded(voxels) => {
+                            gather::copy_common(voxels.view(shape), chunk_box, dst.reborrow(), region);
+                            stored = true;
+                        }
+                    }
+                }
+            }
+        }
+        self.metrics.gathered(region.voxels() as u64);
+        self.metrics.read_ns.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
+        Ok(stored)
+    }
+
     fn plain(&self, input: usize, comp: usize, region: Region) -> Result<Comp> {
         let source = &self.sources[input];
         let mut voxels = self.engine.pool.take(source.info().dtype, region.voxels());
@@ -122,7 +169,7 @@ impl Reader<'_> {
         region: Region,
         uses: &Uses,
         place: u32,
-        counts: bool,
+        why: Why,
     ) -> Result<(Comp, bool)> {
         let source = &self.sources[input];
         let info = source.info();
@@ -131,10 +178,11 @@ impl Reader<'_> {
         let mut target = None;
         let mut common: Option<f64> = None;
         for index in cells.iter() {
-            let mut future = uses.of(index, place);
-            if !counts {
-                future = Future { uses: None, next: place };
-            }
+            let future = match why {
+                Why::Brick => uses.of(index, place),
+                Why::Mask => Future { uses: None, next: place, now: place },
+                Why::Fetched => Future { now: place, ..Future::UNKNOWN },
+            };
             let chunk = self.cache.get(source, (input, comp, index), future, self.engine.pool, self.metrics)?;
             let chunk_box = Region::of_cell(index, [0; 3], shape);
             if let (Chunk::Missing(value), None) = (&chunk, &target)
@@ -152,7 +200,7 @@ impl Reader<'_> {
                 buffer
             });
             match &chunk {
-                Chunk::Missing(value) => fill_box(dst, region, chunk_box, *value),
+                Chunk::Missing(value) => fill_box(dst.view_mut(region.shape()), region, chunk_box, *value),
                 Chunk::Decoded(voxels) => copy_into(voxels.view(shape), chunk_box, dst, region),
             }
         }
@@ -165,7 +213,7 @@ impl Reader<'_> {
 }
 
 /// Sets the part of a dense buffer over `region` that `part` covers.
-fn fill_box(dst: &mut crate::brick::Voxels, region: Region, part: Region, value: f64) {
+fn fill_box(dst: AnyViewMut, region: Region, part: Region, value: f64) {
     fn run<T: Voxel>(mut v: crate::grid::ViewMut<T>, region: Region, part: Region, value: f64) {
         let common = part.clip(&region);
         if common.is_empty() {
@@ -178,5 +226,5 @@ fn fill_box(dst: &mut crate::brick::Voxels, region: Region, part: Region, value:
             }
         }
     }
-    crate::with_view!(AnyViewMut, dst.view_mut(region.shape()), v => run(v, region, part, value));
+    crate::with_view!(AnyViewMut, dst, v => run(v, region, part, value));
 }

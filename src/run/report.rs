@@ -47,4 +47,8 @@ pub struct StageReport {
     pub voxels: u64,
     /// Of a stage on the GPU: bricks that CPU workers took while all of its slots were taken.
     pub bricks_on_cpu: u64,
+    /// Of a sweep: its lines in strips of bricks (`total`), and those of them that were not searched: without a needed voxel
+    /// (`where`), or with nothing greater in reach (`open`).
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub lines: BTreeMap<String, u64>,
 }

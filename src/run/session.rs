@@ -426,7 +426,9 @@ impl<'a> Session<'a> {
             let (seconds, voxels) = self.metrics.step_totals(s);
             let device = self.plan.placement[s].1.into();
             let bricks_on_cpu = self.metrics.shared_bricks(s);
-            report.stages.push(StageReport { name: step.stages.join("+"), seconds, device, voxels, bricks_on_cpu });
+            let lines = self.metrics.line_counts(s);
+            let name = step.stages.join("+");
+            report.stages.push(StageReport { name, seconds, device, voxels, bricks_on_cpu, lines });
         }
         report.byte_identity_waived = self.plan.waives_byte_identity();
         report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();

@@ -17,7 +17,7 @@ use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
 use crate::kernel::{Context, gaussian, gradient, levels, mask, moments4, pointwise, rank, window};
 use crate::plan::Plan;
-use crate::plan::graph::{Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire};
+use crate::plan::graph::{Mask, Moment, Step, StepId, StepKind, TransferChannel, Wire, WireId};
 use crate::stage::WindowParams;
 
 /// What all bricks of a run share.
@@ -34,6 +34,9 @@ pub struct Engine<'a> {
     pub gpu: Option<&'a Gpu>,
     pub(super) metrics: &'a Metrics,
 }
+
+/// Reads a box of an input's wire while a step runs.
+pub type Fetch<'a> = dyn Fn(WireId, Region, AnyViewMut) -> Result<()> + 'a;
 
 /// A mask over a step's output box: 1 = needed.
 #[derive(Debug)]
@@ -94,10 +97,11 @@ impl<'a> Engine<'a> {
         wires.map(|w| Value::constant(w.dtype, region, w.components, w.fill)).collect()
     }
 
-    /// Computes a step on `region`; `values` holds its inputs, each covering what it needs.
+    /// Computes a step on `region`; `values` holds its inputs, each covering what it needs but for what `fetch` reads.
     ///
     /// # Errors
-    /// A GPU that failed twice.
+    /// A GPU that failed twice, or an input that could not be read.
+    #[allow(clippy::too_many_arguments)]
     pub fn run(
         &self,
         id: StepId,
@@ -105,6 +109,7 @@ impl<'a> Engine<'a> {
         mask: &MaskValue,
         region: Region,
         volume: Region,
+        fetch: &Fetch,
         scratch: &mut Scratch,
     ) -> Result<Vec<Value>> {
         let step = &self.plan.graph.steps[id];
@@ -113,6 +118,7 @@ impl<'a> Engine<'a> {
         }
         if self.skip
             && matches!(mask, MaskValue::All)
+            && !step.streamed
             && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)?
         {
             return Ok(values);
@@ -122,7 +128,11 @@ impl<'a> Engine<'a> {
                 value.materialize(self.pool);
             }
         }
-        let mut outputs = self.compute(id, &inputs_of(step, values), region, volume, scratch)?;
+        let mut outputs = if step.streamed {
+            self.sweep_streamed(id, &inputs_of(step, values), mask, region, volume, fetch, scratch)?
+        } else {
+            self.compute(id, &inputs_of(step, values), mask, region, volume, scratch)?
+        };
         if let MaskValue::Some(needed) = mask {
             for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
                 let fill = self.plan.graph.wires[w].fill;
@@ -159,7 +169,7 @@ impl<'a> Engine<'a> {
                 Value { dtype: v.dtype, region: one, comps: comps.collect() }
             })
             .collect();
-        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), one, one, scratch)?;
+        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), &MaskValue::All, one, one, scratch)?;
         let spread = |value: Value| {
             let comps = value.comps.iter().map(|c| match c {
                 Comp::Const(v) => Comp::Const(*v),
@@ -174,6 +184,7 @@ impl<'a> Engine<'a> {
         &self,
         id: StepId,
         inputs: &[&Value],
+        mask: &MaskValue,
         region: Region,
         volume: Region,
         scratch: &mut Scratch,
@@ -193,6 +204,7 @@ impl<'a> Engine<'a> {
                     [colour.is_some(), normal.is_some()],
                     inputs,
                     &mut outputs,
+                    mask,
                     region,
                     volume,
                     &mut cx,

@@ -162,7 +162,7 @@ impl<W: Send> Stream<'_, W> {
         let mut scratch = free.unwrap_or_else(mine);
         let result = guarded(|| {
             let engine = self.reader.engine;
-            let done = evaluate(engine, self.reader.program, loaded, &mut scratch, self.metrics, self.trace)?;
+            let done = evaluate(self.reader, loaded, &mut scratch, self.trace)?;
             let start = Instant::now();
             let written = (self.deliver)(&done, work, &mut scratch);
             self.metrics.encode_ns.fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);

@@ -57,7 +57,13 @@ fn openness(gpu: Option<&Gpu>, p: &ObscuranceParams, v: &Placed, out: Region) ->
         }
         None => {
             let openness = Some(AnyViewMut::F32(view));
-            sweep.sweep(src, region, out, ObscuranceIo { colour: None, normal: None, openness, rgb: None }, &mut cx);
+            sweep.sweep(
+                src,
+                region,
+                out,
+                ObscuranceIo { colour: None, normal: None, needed: None, openness, rgb: None },
+                &mut cx,
+            );
         }
     }
     made

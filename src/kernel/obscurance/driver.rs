@@ -11,6 +11,7 @@ use super::keys::{Key, LANES, Volume};
 use super::lines::{Family, displacement};
 use super::scan::{self, Hit, Sheet, Spans};
 use super::sinks::{Sink, Strip, Visit};
+use super::wanted::{self, LineCounts, Look, Wanted};
 use crate::grid::Region;
 use crate::kernel::simd::Level;
 
@@ -46,9 +47,9 @@ pub(super) struct Buffers<'a, K> {
 pub(super) const TOGETHER: usize = 4;
 
 /// Frame axis along which lines of a family run, and the one across which its sheets follow each other.
-fn axes(family: &Family) -> (usize, usize) {
+pub(super) fn axes(family: &Family) -> [usize; 2] {
     let along = usize::from(family.axis == 1);
-    (along, 1 - along)
+    [along, 1 - along]
 }
 
 /// Frame of the keys that a family reads; see [`FRAMES`].
@@ -58,14 +59,14 @@ pub(super) fn frame_of(family: &Family) -> usize {
 
 /// Families sorted so that those that can be swept together stand together.
 pub(super) fn sort(families: &mut [Family]) {
-    let key = |f: &Family| (f.axis, f.slope[FRAMES[frame_of(f)][axes(f).1]]);
+    let key = |f: &Family| (f.axis, f.slope[FRAMES[frame_of(f)][axes(f)[1]]]);
     families.sort_by(|a, b| key(a).0.cmp(&key(b).0).then(key(a).1.total_cmp(&key(b).1)));
 }
 
 /// Runs of sorted families that are swept together.
 pub(super) fn groups(families: &[Family]) -> impl Iterator<Item = &[Family]> {
     let alike = |f: &Family, g: &Family| {
-        let b = FRAMES[frame_of(f)][axes(f).1];
+        let b = FRAMES[frame_of(f)][axes(f)[1]];
         f.axis == g.axis && f.slope[b] == g.slope[b]
     };
     families.chunk_by(alike).flat_map(|run| run.chunks(TOGETHER))
@@ -77,18 +78,21 @@ pub(super) fn reach_in(family: &Family, extent: usize) -> usize {
 }
 
 /// Sweeps both senses of a group of families (see [`groups`]) over `tile` (natural order), reading the keys of their
-/// frame and looking `most` planes ahead at most. Answers are "open" wherever nothing is in reach.
+/// frame and looking `most` planes ahead at most. Answers are "open" wherever nothing is in reach, and for lines without a
+/// voxel that is `wanted`.
+#[allow(clippy::too_many_arguments)]
 pub(super) fn sweep_group<K: Key, S: Sink>(
     level: Level,
     group: &[Family],
     most: usize,
     volume: Volume<K>,
     tile: Region,
+    wanted: Option<Wanted>,
     buffers: &mut Buffers<K>,
     sink: &mut S,
-) {
+) -> LineCounts {
     let perm = FRAMES[frame_of(&group[0])];
-    let (a, b) = axes(&group[0]);
+    let [a, b] = axes(&group[0]);
     let planes = volume.region.shape()[a];
     let origin = volume.region.lo[a];
     let Buffers { sheet, hits, stack, starts, turned, shifts, tables } = buffers;
@@ -125,12 +129,12 @@ pub(super) fn sweep_group<K: Key, S: Sink>(
     });
     let mut room = Room { rows: sheet, stack, starts, turned };
     let visits = &visits[..group.len()];
-    let job = Job { volume, tile: in_frame(tile, perm), axis: a, visits };
+    let job = Job { volume, tile: in_frame(tile, perm), axis: a, visits, wanted };
     let [forward, backward] = hits;
     if visits.iter().all(|visit| visit.reach <= u8::MAX as usize) {
-        run::<K, u8, S>(level, &job, [bytes_of(forward), bytes_of(backward)], &mut room, sink);
+        run::<K, u8, S>(level, &job, [bytes_of(forward), bytes_of(backward)], &mut room, sink)
     } else {
-        run::<K, u32, S>(level, &job, [forward, backward], &mut room, sink);
+        run::<K, u32, S>(level, &job, [forward, backward], &mut room, sink)
     }
 }
 
@@ -147,6 +151,7 @@ struct Job<'a, K> {
     axis: usize,
     /// They share the axis and the displacement along the other axis across it.
     visits: &'a [Visit<'a>],
+    wanted: Option<Wanted<'a>>,
 }
 
 /// Parts of [`Buffers`] that the search needs.
@@ -175,8 +180,15 @@ fn span(shift: &[i32]) -> (i64, i64) {
     (a.min(b), a.max(b))
 }
 
-fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2], room: &mut Room<K>, sink: &mut S) {
-    let Job { volume, tile, axis, visits } = job;
+fn run<K: Key, H: Hit, S: Sink>(
+    level: Level,
+    job: &Job<K>,
+    hits: [&mut [H]; 2],
+    room: &mut Room<K>,
+    sink: &mut S,
+) -> LineCounts {
+    let Job { volume, tile, axis, visits, wanted } = job;
+    let mut counts = LineCounts::default();
     let (a, b) = (*axis, 1 - *axis);
     let origin = volume.region.lo[a];
     let whole = (tile.lo[a] - origin) as usize..(tile.hi[a] - origin) as usize;
@@ -197,26 +209,48 @@ fn run<K: Key, H: Hit, S: Sink>(level: Level, job: &Job<K>, hits: [&mut [H]; 2],
                 if planes.is_empty() {
                     continue;
                 }
-                let strip = Strip { axis: a, planes, start: [s_b, s_c], tile };
+                let mut strip = Strip { axis: a, planes, start: [s_b, s_c], tile, rows: &[] };
+                let mut spans = spans(&shift_c[strip.planes.clone()], s_c, tile);
+                let asked = |spans: &Spans| spans.iter().filter(|[from, end]| from < end).count() as u64;
+                let all = asked(&spans);
+                counts.total += all;
+                let look = wanted.as_ref().map(|wanted| wanted.look(visit, &strip));
+                if let Some(look) = &look {
+                    counts.masked += all - look.live.count_ones() as u64;
+                    if look.live == 0 {
+                        continue;
+                    }
+                    (strip.planes, spans) = (look.planes.clone(), look.spans);
+                    strip.rows = look.rows();
+                }
                 if i == 0 {
                     sink.expect(visit, &strip);
                 }
-                sheet(level, volume, visit, &strip, [&mut *forward, &mut *backward], room, sink);
+                let sparse = look.as_ref().filter(|look| look.is_sparse(visit.reach));
+                let busy =
+                    sheet(level, volume, visit, &strip, &spans, sparse, [&mut *forward, &mut *backward], room, sink);
+                let searched =
+                    spans.iter().enumerate().filter(|(lane, [from, end])| from < end && busy >> lane & 1 == 0);
+                counts.open += searched.count() as u64;
             }
         }
     }
+    counts
 }
 
-/// Searches the lines of one strip and hands the answers on.
+/// Searches the lines of one strip, hands the answers on, and returns the lanes that could have been occluded.
+#[allow(clippy::too_many_arguments)]
 fn sheet<K: Key, H: Hit, S: Sink>(
     level: Level,
     volume: &Volume<K>,
     visit: &Visit,
     strip: &Strip,
+    spans: &Spans,
+    sparse: Option<&Look>,
     hits: [&mut [H]; 2],
     room: &mut Room<K>,
     sink: &mut S,
-) {
+) -> u64 {
     let [shift_b, shift_c] = visit.shifts;
     let Range { start, end } = strip.planes;
     let first = start.saturating_sub(visit.reach);
@@ -230,21 +264,18 @@ fn sheet<K: Key, H: Hit, S: Sink>(
             answers[way] = &mut hits[..count];
         }
     }
-    let spans = spans(&shift_c[start..end], strip.start[1], strip.tile);
     let asked = answers.each_mut().map(|a| &mut **a);
-    scan::both(
-        level,
-        sheet,
-        &spans,
-        start - first..end - first,
-        visit.reach,
-        asked,
-        room.rows,
-        room.stack,
-        room.turned,
-    );
+    let queries = start - first..end - first;
+    let busy = match sparse {
+        Some(look) => {
+            wanted::walk(sheet, look.rows(), queries, visit.reach, asked);
+            u64::MAX
+        }
+        None => scan::both(level, sheet, spans, queries, visit.reach, asked, room.rows, room.stack, room.turned),
+    };
     let [forward, backward] = answers;
     sink.add(visit, strip, forward, backward);
+    busy
 }
 
 /// The planes of each lane that lie inside the tile.
@@ -296,13 +327,14 @@ fn place<K: Key>(
     starts: &mut [usize],
 ) {
     let b = 1 - a;
-    let n = volume.region.shape();
-    let (lo_b, lo_c) = (volume.region.lo[b], volume.region.lo[2]);
+    let Region { lo, hi } = volume.region;
+    let last = hi[2] - lo[2];
     let shifts = shift_b[first..].iter().zip(&shift_c[first..]);
     for ((plane, start), (&d_b, &d_c)) in (first..).zip(starts).zip(shifts) {
-        let (j, k) = (s_b + d_b as i64 - lo_b, s_c + d_c as i64 - lo_c);
-        let inside = (0..n[b] as i64).contains(&j) && (-(LANES as i64)..n[2] as i64).contains(&k);
-        let (i0, i1) = if a == 0 { (plane, j as usize) } else { (j as usize, plane) };
+        let (j, k) = (s_b + d_b as i64, s_c + d_c as i64 - lo[2]);
+        let inside = (lo[b]..hi[b]).contains(&j) && (-(LANES as i64)..last).contains(&k);
+        let row = volume.sheared.map_or(j - lo[b], |first| s_b - first) as usize;
+        let (i0, i1) = if a == 0 { (plane, row) } else { (row, plane) };
         *start = if inside { volume.start(i0, i1, k) } else { 0 };
     }
 }

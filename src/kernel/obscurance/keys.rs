@@ -1,6 +1,6 @@
 //! Voxels as unsigned keys in the order of their density, in a padded copy that every line can read without a test.
 
-use crate::grid::{Region, Shape, View, Voxel};
+use crate::grid::{AnyViewMut, Region, Shape, View, ViewMut, Voxel};
 use crate::multiversion;
 
 /// Lines that are swept together, and zeros around every row of a [`Volume`].
@@ -45,29 +45,32 @@ pub(super) trait Coded: Voxel {
     type Key: Key;
     /// Strictly increasing; equal only for equal values (-0.0 equals 0.0). NaN must be asked for before.
     fn code(self) -> Self::Key;
+    /// A view without its type.
+    fn any(view: ViewMut<Self>) -> AnyViewMut;
 }
 
 macro_rules! coded {
-    ($($t:ty => $k:ty, $v:ident => $code:expr;)*) => {$(
+    ($($t:ty: $d:ident => $k:ty, $v:ident => $code:expr;)*) => {$(
         impl Coded for $t {
             type Key = $k;
             #[inline(always)]
             fn code(self) -> $k { let $v = self; $code }
+            fn any(view: ViewMut<$t>) -> AnyViewMut { AnyViewMut::$d(view) }
         }
     )*};
 }
 coded! {
-    u8 => u8, v => v;
-    i8 => u8, v => v as u8 ^ 0x80;
-    u16 => u16, v => v;
-    i16 => u16, v => v as u16 ^ 0x8000;
-    u32 => u32, v => v;
-    i32 => u32, v => v as u32 ^ 0x8000_0000;
-    f32 => u32, v => {
+    u8: U8 => u8, v => v;
+    i8: I8 => u8, v => v as u8 ^ 0x80;
+    u16: U16 => u16, v => v;
+    i16: I16 => u16, v => v as u16 ^ 0x8000;
+    u32: U32 => u32, v => v;
+    i32: I32 => u32, v => v as u32 ^ 0x8000_0000;
+    f32: F32 => u32, v => {
         let bits = (v + 0.0).to_bits();
         bits ^ ((bits as i32 >> 31) as u32 | 0x8000_0000)
     };
-    f64 => u64, v => {
+    f64: F64 => u64, v => {
         let bits = (v + 0.0).to_bits();
         bits ^ ((bits as i64 >> 63) as u64 | 1 << 63)
     };
@@ -104,17 +107,25 @@ fn strides(shape: Shape) -> (usize, usize) {
 #[derive(Clone, Copy)]
 pub(super) struct Volume<'a, K> {
     data: &'a [K],
-    row: usize,
-    plane: usize,
+    /// Elements from one index to the next along the first two axes.
+    strides: [usize; 2],
     /// Global indices, in frame order.
     pub region: Region,
+    /// Set where rows are counted by the line that meets them, from this one on; see [`super::column`].
+    pub sheared: Option<i64>,
 }
 
 impl<'a, K: Key> Volume<'a, K> {
     pub fn new(data: &'a [K], region: Region) -> Self {
         let (row, plane) = strides(region.shape());
         assert!(data.len() >= padded_len(region.shape()), "padded copy is too short");
-        Volume { data, row, plane, region }
+        Volume { data, strides: [plane, row], region, sheared: None }
+    }
+
+    /// Rows counted by their lines from `first` on. `region` is what has voxels; [`LANES`] zeros stand at 0 and around
+    /// every row.
+    pub fn sheared(data: &'a [K], strides: [usize; 2], region: Region, first: i64) -> Self {
+        Volume { data, strides, region, sheared: Some(first) }
     }
 
     /// All keys; the first [`LANES`] are zeros, and so are those around every row.
@@ -126,7 +137,7 @@ impl<'a, K: Key> Volume<'a, K> {
     /// inside it, `-LANES <= k <= n`.
     #[inline(always)]
     pub fn start(&self, i: usize, j: usize, k: i64) -> usize {
-        ((i * self.plane + j * self.row + LANES) as i64 + k) as usize
+        ((i * self.strides[0] + j * self.strides[1] + LANES) as i64 + k) as usize
     }
 }
 
@@ -139,7 +150,7 @@ pub(super) struct Code<T> {
 
 impl<T: Coded> Code<T> {
     #[inline(always)]
-    fn key(self, v: T) -> T::Key {
+    pub fn key(self, v: T) -> T::Key {
         match (is_missing(v, self.missing), self.flipped) {
             (true, _) => T::Key::ZERO,
             (false, true) => v.code().not(),

@@ -98,6 +98,11 @@ fn family_of(w: [f64; 3], p: &ObscuranceParams) -> (Family, usize) {
 }
 
 impl Family {
+    /// Sum of the contributions of both senses where nothing occludes.
+    pub fn open(&self) -> u64 {
+        self.senses.iter().flatten().map(|s| s.table[self.reach] as u64).sum()
+    }
+
     /// Voxels per axis that a line may move within reach.
     pub fn halo(&self) -> [usize; 3] {
         std::array::from_fn(|b| match self.slope[b].abs() {

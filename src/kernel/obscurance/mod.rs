@@ -5,11 +5,15 @@
 //! | `lines` | directions to families of lines, distances, fixed-point contributions |
 //! | `keys` | voxels to padded, order-preserving unsigned keys |
 //! | `driver` | tiles, sheets, senses |
+//! | `column`, `stream` | sweeps of boxes whose halos do not fit into memory |
 //! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide` and `turn`: by AVX-512 |
-//! | `sinks`, `contribute` | what is summed |
+//! | `sinks`, `contribute`, `weighted` | what is summed |
+//! | `wanted` | which lines are searched |
+//! | `room` | how scratch is cut up |
 //! | `shared` | what another device needs |
 //! | `reference` | all of it by the definition |
 
+mod column;
 mod contribute;
 mod driver;
 mod keys;
@@ -18,13 +22,17 @@ mod lines;
 mod narrow;
 #[cfg(test)]
 mod reference;
+mod room;
 mod scan;
 pub mod shared;
 mod sinks;
+mod stream;
 #[cfg(test)]
 mod tests;
 #[cfg(target_arch = "x86_64")]
 mod turn;
+mod wanted;
+mod weighted;
 #[cfg(target_arch = "x86_64")]
 mod wide;
 
@@ -33,11 +41,16 @@ use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::simd::Level;
 use crate::stage::{DirectionSet, DirectionWeights, Rho};
 use crate::with_view;
-use driver::{Buffers, FRAMES, TOGETHER, in_frame};
-use keys::{Coded, Key, LANES, Plain, Volume};
-use sinks::{OpenSum, Sink, WeightedSum};
+use driver::{Buffers, FRAMES, in_frame};
+use keys::{Coded, Key, Volume};
+use room::{Sizes, carve};
+use sinks::{OpenSum, Sink};
+use wanted::Wanted;
+use weighted::WeightedSum;
 
 pub use lines::{is_valid_count, rho};
+pub use stream::Fetch;
+pub use wanted::LineCounts;
 
 /// Parameters with units resolved.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,17 +78,22 @@ pub struct Prepared {
     families: Vec<lines::Family>,
     /// Sum of contributions where nothing occludes.
     total: u64,
+    /// Sum of weights, in units of the weighted sums.
+    uniform: i64,
 }
 
 /// What a sweep reads besides densities, and writes.
 pub struct ObscuranceIo<'a> {
-    /// Colour of each voxel of `src` (linear r, g, b), for colour bleeding. NaN counts as 0, and everything is cut off
-    /// at +-2^18.
-    pub colour: Option<[View<'a, f32>; 3]>,
+    /// Colour of each voxel of `src` (linear r, g, b, and a number that is not looked at: an occluder's colour is one read),
+    /// for colour bleeding. NaN counts as 0, and everything is cut off at +-2^18.
+    pub colour: Option<View<'a, [f32; 4]>>,
     /// Components along z, y, x of the physical gradient of the *stored* values on the *output* box, for
     /// `weight_by_normal`: directions weigh max(0, n.w), n pointing toward the open side. Uniform where it is zero or not
     /// finite. Where no direction of the set has a positive weight, the voxel is open.
     pub normal: Option<[View<'a, f32>; 3]>,
+    /// Voxels of the output box that are asked for: 0 is not, and its outputs are left alone or filled with anything. Lines
+    /// without one that is are not searched.
+    pub needed: Option<View<'a, u8>>,
     /// f32, the output box.
     pub openness: Option<AnyViewMut<'a>>,
     /// f32, the output box. Asks for `colour`.
@@ -87,8 +105,8 @@ pub struct ObscuranceIo<'a> {
 /// in one tile 0.76 ns per voxel and direction, `[128, 256, 256]` in two tiles 1.08. A sweep of one tile keeps one copy of
 /// the keys, so that 256^3 takes the bytes of two tiles of half the size.
 const TILE: Shape = [256; 3];
-/// The same for sums of 64 bits, which take five times as much.
-const WEIGHTED_TILE: Shape = [256, 128, 256];
+/// The same for sums of 64 bits, of which there are up to five.
+const WEIGHTED_TILE: Shape = [128, 128, 256];
 
 /// Extents of a tile of an output box.
 fn tile_of(dst: Shape, weighted: bool) -> Shape {
@@ -103,7 +121,8 @@ impl Prepared {
         assert!(params.max_distance >= 0.0, "max_distance {}", params.max_distance);
         let (mut families, total) = lines::families(params);
         driver::sort(&mut families);
-        Prepared { params: params.clone(), families, total }
+        let uniform = weighted::uniform(&families);
+        Prepared { params: params.clone(), families, total, uniform }
     }
 
     /// Halo in voxels per axis.
@@ -116,19 +135,38 @@ impl Prepared {
     ///
     /// Within 1e-6 of the formula; the bits do not depend on the boxes, nor on the level of the CPU.
     /// Panics if an extent does not fit its box, an output is not f32, or `rgb` comes without `colour`.
-    pub fn sweep(&self, src: AnyView, src_box: Region, dst_box: Region, io: ObscuranceIo, cx: &mut Context) {
+    pub fn sweep(
+        &self,
+        src: AnyView,
+        src_box: Region,
+        dst_box: Region,
+        io: ObscuranceIo,
+        cx: &mut Context,
+    ) -> LineCounts {
         assert_eq!(src.shape(), src_box.shape(), "src must cover its box");
         assert!(src_box.contains(&dst_box), "{src_box:?} must contain {dst_box:?}");
         if dst_box.is_empty() {
-            return;
+            return LineCounts::default();
         }
-        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx));
+        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx))
     }
 
-    /// Bytes of scratch that [`Self::sweep`] takes at most.
+    /// Bytes of scratch that [`Self::sweep`] takes at most, apart from [`Self::masked_bytes`].
     pub fn scratch_bytes(&self, dtype: DType, src: Shape, dst: Shape, colour: bool, normal: bool) -> usize {
         let key = dtype.size();
         self.sizes(src, dst, colour || normal).bytes(key, colour, normal)
+    }
+
+    /// Bytes of scratch that a sweep takes besides where only some voxels are needed.
+    pub fn masked_bytes(&self, dst: Shape) -> usize {
+        8 * self.mask_words(dst).iter().map(|words| words.next_multiple_of(8)).sum::<usize>()
+    }
+
+    /// Words of the bits of a tile's needed voxels, in both frames.
+    fn mask_words(&self, dst: Shape) -> [usize; 2] {
+        let tile = tile_of(dst, false);
+        let turned = self.families.iter().any(|f| f.axis == 2);
+        [wanted::words_of(tile), if turned { wanted::words_of(FRAMES[1].map(|a| tile[a])) } else { 0 }]
     }
 
     fn sizes(&self, src: Shape, dst: Shape, weighted: bool) -> Sizes {
@@ -139,7 +177,6 @@ impl Prepared {
         Sizes {
             keys: if tile == dst { [copies[0].max(copies[1]), 0] } else { copies },
             sums: FRAMES.map(|frame| sinks::sums_len(tile, frame)),
-            tile: tile.iter().product(),
             sheet: self.families.iter().map(planes).max().unwrap_or(0),
             queries: tile.into_iter().max().unwrap_or(0),
             extent: src.into_iter().max().unwrap_or(0),
@@ -153,20 +190,17 @@ impl Prepared {
         dst_box: Region,
         io: ObscuranceIo,
         cx: &mut Context,
-    ) {
+    ) -> LineCounts {
         let weighted = io.rgb.is_some() || io.normal.is_some();
         let sizes = self.sizes(src_box.shape(), dst_box.shape(), weighted);
-        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()));
+        let words = io.needed.map_or([0; 2], |_| self.mask_words(dst_box.shape()));
+        let mask = io.needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
+        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()) + mask);
+        let (natural_mask, bytes) = carve::<u64>(bytes, words[0]);
+        let (turned_mask, bytes) = carve::<u64>(bytes, words[1]);
         let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
         let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
-        let (sheet, bytes) = carve::<T::Key>(bytes, sizes.sheet * LANES);
-        let (hits, bytes) = carve_all::<u32, 2>(bytes, sizes.queries * LANES);
-        let (stack, bytes) = carve::<u32>(bytes, sizes.sheet);
-        let (starts, bytes) = carve::<usize>(bytes, sizes.sheet);
-        let (turned, bytes) = carve::<u8>(bytes, sizes.turned(size_of::<T>()));
-        let (shifts, bytes) = carve_all::<i32, { 1 + TOGETHER }>(bytes, sizes.extent);
-        let (forward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
-        let (backward, bytes) = carve_all::<u32, TOGETHER>(bytes, sizes.extent + 1);
+        let (buffers, bytes) = sizes.buffers::<T::Key>(bytes);
 
         let missing = keys::missing_of::<T>(self.params.missing);
         let code = keys::Code { missing, flipped: self.params.flipped };
@@ -191,16 +225,17 @@ impl Prepared {
             },
             src_box,
             dst_box,
-            buffers: Buffers { sheet, hits, stack, starts, turned, shifts, tables: [forward, backward] },
+            buffers,
+            masks: [natural_mask, turned_mask],
+            counts: LineCounts::default(),
         };
         // NaN where a voxel of the row that starts at `p` is missing.
         let gone = |p: [i64; 3], row: &mut [f32]| {
             let [z, y, x] = [0, 1, 2].map(|a| (p[a] - src_box.lo[a]) as usize);
-            for (out, &v) in row.iter_mut().zip(&src.row_at(z, y)[x..]) {
-                *out = if keys::is_missing(v, missing) { f32::NAN } else { *out };
-            }
+            mark_missing(&src.row_at(z, y)[x..], missing, row);
         };
         pass.tiles(io, bytes, &gone);
+        pass.counts
     }
 }
 
@@ -214,6 +249,9 @@ struct Pass<'a, K> {
     src_box: Region,
     dst_box: Region,
     buffers: Buffers<'a, K>,
+    /// For the needed voxels of a tile in both frames.
+    masks: [&'a mut [u64]; 2],
+    counts: LineCounts,
 }
 
 /// Padded copies of the source in the order of each frame. A sweep of one tile needs one after the other, in one place.
@@ -238,7 +276,7 @@ impl<K> Keys<'_, K> {
 
 impl<K: Key> Pass<'_, K> {
     fn tiles(&mut self, io: ObscuranceIo, bytes: &mut [u8], gone: &dyn Fn([i64; 3], &mut [f32])) {
-        let ObscuranceIo { colour, normal, openness, rgb } = io;
+        let ObscuranceIo { colour, normal, needed, openness, rgb } = io;
         let mut openness = openness.map(f32_view);
         let mut rgb = rgb.map(|views| views.map(f32_view));
         assert!(rgb.is_none() || colour.is_some(), "rgb needs colours");
@@ -248,21 +286,32 @@ impl<K: Key> Pass<'_, K> {
         let extents = tile_of(dst_box.shape(), weighted);
         for cell in dst_box.cells(dst_box.lo, extents).iter() {
             let tile = Region::of_cell(cell, dst_box.lo, extents).clip(&dst_box);
-            let voxels = tile.voxels();
+            let tile = needed.map_or(tile, |mask| wanted::shrink(tile, mask, dst_box));
+            if tile.is_empty() {
+                continue;
+            }
+            let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
             let len = |frame: usize| if fast { sinks::sums_len(tile.shape(), FRAMES[frame]) } else { 0 };
             let (natural, rest) = carve::<u32>(&mut *bytes, len(0));
             let (turned, rest) = carve::<u32>(rest, len(1));
             let sums = [natural, turned];
-            let (wide, _) = carve_all::<i64, 5>(rest, if weighted { voxels } else { 0 });
+            let lens = FRAMES.map(|frame| sinks::sums_len(tile.shape(), frame));
+            let used = |yes: bool| if yes { lens } else { [0; 2] };
+            let (weights, rest) = weighted::pair(rest, used(normal.is_some()));
+            let (open, rest) = weighted::pair(rest, used(normal.is_some()));
+            let (red, rest) = weighted::pair(rest, used(rgb.is_some()));
+            let (green, rest) = weighted::pair(rest, used(rgb.is_some()));
+            let (blue, _) = weighted::pair(rest, used(rgb.is_some()));
             let mut fast_sum = OpenSum { level: self.level, sums, tile };
             fast_sum.clear();
-            let [weights, open, red, green, blue] = wide;
             let mut wide_sum = WeightedSum {
+                level: self.level,
                 tile,
                 dst_box,
                 src_box: self.src_box,
                 normal,
                 flipped: self.prepared.params.flipped,
+                uniform: self.prepared.uniform,
                 weights,
                 open,
                 ambient: self.prepared.params.ambient,
@@ -272,11 +321,11 @@ impl<K: Key> Pass<'_, K> {
             wide_sum.clear();
             match (fast, weighted) {
                 (true, false) if self.flat => {}
-                (true, false) => self.sweep_tile(tile, &mut fast_sum),
-                (false, true) => self.sweep_tile(tile, &mut wide_sum),
+                (true, false) => self.sweep_tile(tile, needed, &mut fast_sum),
+                (false, true) => self.sweep_tile(tile, needed, &mut wide_sum),
                 (true, true) => {
                     let mut both = (fast_sum, wide_sum);
-                    self.sweep_tile(tile, &mut both);
+                    self.sweep_tile(tile, needed, &mut both);
                     (fast_sum, wide_sum) = both;
                 }
                 (false, false) => return,
@@ -284,39 +333,55 @@ impl<K: Key> Pass<'_, K> {
             if fast && !self.flat {
                 fast_sum.merge();
             }
+            wide_sum.merge();
             let total = self.prepared.total;
             let [nz, ny, nx] = tile.shape();
             let at = dst_box.offset_of(&tile);
             for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-                let first = (z * ny + y) * nx;
                 let gone = |row: &mut [f32]| gone([tile.lo[0] + z as i64, tile.lo[1] + y as i64, tile.lo[2]], row);
                 if let Some(out) = &mut openness {
                     let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
                     match fast {
                         true if self.flat => row.fill(1.0),
-                        true => fast_sum.openness([z, y], total, row),
-                        false => row.iter_mut().zip(first..).for_each(|(out, i)| *out = wide_sum.openness(i)),
+                        true => fast_sum.openness([z, y], 0, total, row),
+                        false => wide_sum.openness([z, y], row),
                     }
                     gone(row);
                 }
                 for (c, out) in rgb.iter_mut().flatten().enumerate() {
                     let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
-                    for (x, out) in row.iter_mut().enumerate() {
-                        *out = wide_sum.colour_of(first + x, c);
-                    }
+                    wide_sum.colour_of([z, y], c, row);
                     gone(row);
                 }
             }
         }
     }
 
-    fn sweep_tile<S: Sink>(&mut self, tile: Region, sink: &mut S) {
+    fn sweep_tile<S: Sink>(&mut self, tile: Region, needed: Option<View<u8>>, sink: &mut S) {
+        let Pass { masks: [natural, turned], counts, .. } = self;
+        let wanted = needed.map(|needed| Wanted::both(needed, natural, turned));
         for group in driver::groups(&self.prepared.families) {
             let frame = driver::frame_of(&group[0]);
             let volume = Volume::new(self.keys.in_frame(frame), in_frame(self.src_box, FRAMES[frame]));
             let most = if self.flat { 0 } else { usize::MAX };
-            driver::sweep_group(self.level, group, most, volume, tile, &mut self.buffers, sink);
+            *counts += driver::sweep_group(
+                self.level,
+                group,
+                most,
+                volume,
+                tile,
+                wanted.map(|w| w[frame]),
+                &mut self.buffers,
+                sink,
+            );
         }
+    }
+}
+
+/// NaN where a voxel of a row is missing.
+fn mark_missing<T: Coded>(voxels: &[T], missing: Option<T>, row: &mut [f32]) {
+    for (out, &v) in row.iter_mut().zip(voxels) {
+        *out = if keys::is_missing(v, missing) { f32::NAN } else { *out };
     }
 }
 
@@ -325,61 +390,4 @@ fn f32_view(view: AnyViewMut) -> ViewMut<f32> {
         AnyViewMut::F32(v) => v,
         other => panic!("obscurance writes f32, not {}", other.dtype()),
     }
-}
-
-/// Elements of the parts of the scratch.
-struct Sizes {
-    /// Padded copies: natural, and with x and z exchanged, or one in the place of both.
-    keys: [usize; 2],
-    /// Sums of both frames of a tile, and its voxels.
-    sums: [usize; 2],
-    tile: usize,
-    /// Planes of a sheet.
-    sheet: usize,
-    /// Planes of a sheet that belong to the tile.
-    queries: usize,
-    /// Longest axis of the source.
-    extent: usize,
-}
-
-impl Sizes {
-    /// Bytes of scratch of the AVX-512 search.
-    fn turned(&self, key: usize) -> usize {
-        #[cfg(target_arch = "x86_64")]
-        return wide::scratch_bytes(self.sheet, self.queries, key);
-        #[cfg(not(target_arch = "x86_64"))]
-        return 0 * key;
-    }
-
-    fn bytes(&self, key: usize, colour: bool, normal: bool) -> usize {
-        let line = |bytes: usize| bytes.next_multiple_of(64);
-        line(self.keys[0] * key)
-            + line(self.keys[1] * key)
-            + line(self.sheet * LANES * key)
-            + 2 * line(self.queries * LANES * 4)
-            + line(self.sheet * 4)
-            + line(self.sheet * size_of::<usize>())
-            + line(self.turned(key))
-            + (1 + TOGETHER) * line(self.extent * 4)
-            + 2 * TOGETHER * line((self.extent + 1) * 4)
-            + if normal { 0 } else { line(self.sums[0] * 4) + line(self.sums[1] * 4) }
-            + if normal || colour { 5 * line(self.tile * 8) } else { 0 }
-    }
-}
-
-/// Cuts `len` elements off the front of a slice that is aligned to 64 bytes.
-fn carve<T: Plain>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
-    let (head, tail) = bytes.split_at_mut((len * size_of::<T>()).next_multiple_of(64));
-    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
-    // SAFETY: aligned (just checked), long enough, and every bit pattern is valid for the integers that are `Plain`.
-    (unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }, tail)
-}
-
-fn carve_all<T: Plain, const N: usize>(mut bytes: &mut [u8], len: usize) -> ([&mut [T]; N], &mut [u8]) {
-    let parts = std::array::from_fn(|_| {
-        let (part, rest) = carve(std::mem::take(&mut bytes), len);
-        bytes = rest;
-        part
-    });
-    (parts, bytes)
 }

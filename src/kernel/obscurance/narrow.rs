@@ -12,11 +12,12 @@ pub(super) const MAX_REACH: usize = u8::MAX as usize;
 /// Steps between two looks at whether all lanes have met their occluder.
 const BURST: usize = 8;
 
-/// Answers of one sense on consecutive rows of 64 keys; see [`super::scan::both`]. False if this CPU and key have no
+/// Answers of one sense on consecutive rows of 64 keys; see [`super::scan::both`]. Lanes that are not `live` are open. False if this CPU and key have no
 /// kernel here, and nothing was done. Panics if `reach` is beyond [`MAX_REACH`].
 pub(super) fn brute<K: Key>(
     level: Level,
     rows: &[K],
+    live: u64,
     queries: Range<usize>,
     reach: usize,
     ahead: bool,
@@ -28,11 +29,11 @@ pub(super) fn brute<K: Key>(
     // for one type of each size.
     unsafe {
         match (size_of::<K>(), level >= Level::Avx2) {
-            (1, true) => avx2_u8(from.cast(), planes, queries, reach, ahead, hits),
-            (2, true) => avx2_u16(from.cast(), planes, queries, reach, ahead, hits),
-            (4, true) => avx2_u32(from.cast(), planes, queries, reach, ahead, hits),
-            (1, false) => sse2_u8(from.cast(), planes, queries, reach, ahead, hits),
-            (2, false) => sse2_u16(from.cast(), planes, queries, reach, ahead, hits),
+            (1, true) => avx2_u8(from.cast(), live, planes, queries, reach, ahead, hits),
+            (2, true) => avx2_u16(from.cast(), live, planes, queries, reach, ahead, hits),
+            (4, true) => avx2_u32(from.cast(), live, planes, queries, reach, ahead, hits),
+            (1, false) => sse2_u8(from.cast(), live, planes, queries, reach, ahead, hits),
+            (2, false) => sse2_u16(from.cast(), live, planes, queries, reach, ahead, hits),
             _ => return false,
         }
     }
@@ -40,13 +41,14 @@ pub(super) fn brute<K: Key>(
 }
 
 macro_rules! brute {
-    ($name:ident, $feature:literal, $t:ty, $v:ty, $load:ident, $store:ident, $ones:expr, $zero:expr, $and:ident, $sub:ident,
+    ($name:ident, $feature:literal, $t:ty, $v:ty, $load:ident, $store:ident, $zero:expr, $and:ident, $or:ident, $sub:ident,
      $some:expr, $le:expr) => {
         /// # Safety
         /// `planes` rows of 64 keys from `rows` on; `queries` among them; the CPU has the feature.
         #[target_feature(enable = $feature)]
         unsafe fn $name(
             rows: *const $t,
+            live: u64,
             planes: usize,
             queries: Range<usize>,
             reach: usize,
@@ -54,14 +56,24 @@ macro_rules! brute {
             hits: &mut [u8],
         ) {
             const R: usize = size_of::<$v>() / size_of::<$t>();
+            let (mut on, mut off) = ([0 as $t; LANES], [0 as $t; LANES]);
+            for (lane, (on, off)) in on.iter_mut().zip(&mut off).enumerate() {
+                *on = if live >> lane & 1 == 0 { 0 } else { <$t>::MAX };
+                *off = !*on;
+            }
             for (query, hits) in queries.zip(hits.chunks_exact_mut(LANES)) {
                 let steps = reach.min(if ahead { planes - 1 - query } else { query });
                 let stride = if ahead { LANES as isize } else { -(LANES as isize) };
                 for lane in (0..LANES).step_by(R) {
+                    if live >> lane & (u64::MAX >> (64 - R)) == 0 {
+                        hits[lane..lane + R].fill(reach as u8);
+                        continue;
+                    }
                     let mut at = rows.wrapping_add(query * LANES + lane);
                     // SAFETY: a row of the sheet.
                     let key = unsafe { $load(at.cast()) };
-                    let (mut alive, mut count): ($v, $v) = ($ones, $zero);
+                    // SAFETY: one flag per lane.
+                    let (mut alive, mut count): ($v, $v) = (unsafe { $load(on.as_ptr().add(lane).cast()) }, $zero);
                     let mut left = steps;
                     while left > 0 && $some(alive) {
                         let burst = left.min(BURST);
@@ -78,7 +90,9 @@ macro_rules! brute {
                     // SAFETY: arrays of the size of a vector.
                     unsafe {
                         $store(counts.as_mut_ptr().cast(), count);
-                        $store(open.as_mut_ptr().cast(), alive);
+                        // Lanes that were never on are open as well.
+                        let off = $load(off.as_ptr().add(lane).cast());
+                        $store(open.as_mut_ptr().cast(), $or(alive, off));
                     }
                     for ((hit, count), open) in hits[lane..].iter_mut().zip(counts).zip(open) {
                         *hit = if open != 0 { reach as u8 } else { count as u8 };
@@ -96,9 +110,9 @@ brute!(
     __m256i,
     _mm256_loadu_si256,
     _mm256_storeu_si256,
-    _mm256_set1_epi8(-1),
     _mm256_setzero_si256(),
     _mm256_and_si256,
+    _mm256_or_si256,
     _mm256_sub_epi8,
     |v| _mm256_testz_si256(v, v) == 0,
     |r, q| _mm256_cmpeq_epi8(_mm256_max_epu8(r, q), q)
@@ -110,9 +124,9 @@ brute!(
     __m256i,
     _mm256_loadu_si256,
     _mm256_storeu_si256,
-    _mm256_set1_epi8(-1),
     _mm256_setzero_si256(),
     _mm256_and_si256,
+    _mm256_or_si256,
     _mm256_sub_epi16,
     |v| _mm256_testz_si256(v, v) == 0,
     |r, q| _mm256_cmpeq_epi16(_mm256_max_epu16(r, q), q)
@@ -124,9 +138,9 @@ brute!(
     __m256i,
     _mm256_loadu_si256,
     _mm256_storeu_si256,
-    _mm256_set1_epi8(-1),
     _mm256_setzero_si256(),
     _mm256_and_si256,
+    _mm256_or_si256,
     _mm256_sub_epi32,
     |v| _mm256_testz_si256(v, v) == 0,
     |r, q| _mm256_cmpeq_epi32(_mm256_max_epu32(r, q), q)
@@ -138,9 +152,9 @@ brute!(
     __m128i,
     _mm_loadu_si128,
     _mm_storeu_si128,
-    _mm_set1_epi8(-1),
     _mm_setzero_si128(),
     _mm_and_si128,
+    _mm_or_si128,
     _mm_sub_epi8,
     |v| _mm_movemask_epi8(v) != 0,
     |r, q| _mm_cmpeq_epi8(_mm_max_epu8(r, q), q)
@@ -152,9 +166,9 @@ brute!(
     __m128i,
     _mm_loadu_si128,
     _mm_storeu_si128,
-    _mm_set1_epi8(-1),
     _mm_setzero_si128(),
     _mm_and_si128,
+    _mm_or_si128,
     _mm_sub_epi16,
     |v| _mm_movemask_epi8(v) != 0,
     |r, q| _mm_cmpeq_epi16(_mm_subs_epu16(r, q), _mm_setzero_si128())

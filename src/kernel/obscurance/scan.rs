@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use super::keys::{Key, LANES};
 use crate::kernel::simd::Level;
+use crate::multiversion;
 
 /// Steps without an occluder, per query: small enough to be stored for two senses of a sheet.
 pub(super) trait Hit: Copy + Default + Send + Sync + 'static {
@@ -95,7 +96,7 @@ fn stacked<K: Key, H: Hit>(
     }
 }
 
-/// For each lane the queries that are wanted, from and to, counted from the first; answers of others may be anything.
+/// For each lane the queries that are wanted, from and to, counted from the first; others are answered, or open.
 pub(super) type Spans = [[u32; 2]; LANES];
 
 /// Planes of 64 keys, where they stand in a padded volume.
@@ -122,7 +123,8 @@ impl<K: Key> Sheet<'_, K> {
 const BRUTE: usize = 768;
 
 /// Answers of both senses (growing plane numbers first); an empty slice of hits is a sense that is not asked for.
-/// `rows` and `stack` have room for the planes, `turned` for what the AVX-512 search asks.
+/// `rows` and `stack` have room for the planes, `turned` for what the AVX-512 search asks. Returns the lanes in which some
+/// query is less than some plane: all others are open.
 #[allow(clippy::too_many_arguments)]
 pub(super) fn both<K: Key, H: Hit>(
     level: Level,
@@ -134,13 +136,13 @@ pub(super) fn both<K: Key, H: Hit>(
     rows: &mut [K],
     stack: &mut [u32],
     turned: &mut [u8],
-) {
+) -> u64 {
     #[cfg(target_arch = "x86_64")]
     {
         let short = reach.min(SHORT);
         let mut hits = hits;
         if reach - short <= BEYOND
-            && short_answers(level, sheet, spans, queries.clone(), short, &mut hits, rows, turned)
+            && let Some(busy) = short_answers(level, sheet, spans, queries.clone(), short, &mut hits, rows, turned)
         {
             for (way, hits) in hits.into_iter().enumerate() {
                 H::widen(hits);
@@ -148,23 +150,55 @@ pub(super) fn both<K: Key, H: Hit>(
                     beyond(sheet, queries.clone(), short, reach, way == 0, hits);
                 }
             }
-            return;
+            return busy;
         }
-        for (way, hits) in hits.into_iter().enumerate().filter(|(_, hits)| !hits.is_empty()) {
-            let rows = &mut rows[..sheet.planes.len() * LANES];
-            sheet.copy_to(rows);
-            stacked(rows, queries.clone(), reach, way == 0, hits, stack);
-        }
+        stacks(level, sheet, queries, reach, hits, rows, stack)
     }
     #[cfg(not(target_arch = "x86_64"))]
     {
-        let _ = (level, spans, turned);
-        let rows = &mut rows[..sheet.planes.len() * LANES];
-        sheet.copy_to(rows);
-        for (way, hits) in hits.into_iter().enumerate().filter(|(_, hits)| !hits.is_empty()) {
-            stacked(rows, queries.clone(), reach, way == 0, hits, stack);
+        let _ = (spans, turned);
+        stacks(level, sheet, queries, reach, hits, rows, stack)
+    }
+}
+
+/// [`both`] by stacks.
+fn stacks<K: Key, H: Hit>(
+    level: Level,
+    sheet: Sheet<K>,
+    queries: Range<usize>,
+    reach: usize,
+    hits: [&mut [H]; 2],
+    rows: &mut [K],
+    stack: &mut [u32],
+) -> u64 {
+    let rows = &mut rows[..sheet.planes.len() * LANES];
+    sheet.copy_to(rows);
+    let busy = busy(level, rows, queries.clone());
+    for (way, hits) in hits.into_iter().enumerate().filter(|(_, hits)| !hits.is_empty()) {
+        match busy {
+            0 => hits.fill(H::of(reach)),
+            _ => stacked(rows, queries.clone(), reach, way == 0, hits, stack),
         }
     }
+    busy
+}
+
+multiversion! {
+    /// Lanes of consecutive rows of 64 keys in which some query is less than some plane.
+    fn busy[K: Key](rows: &[K], queries: Range<usize>) -> u64 = busy_lanes;
+}
+
+#[inline(always)]
+fn busy_lanes<K: Key>(rows: &[K], queries: Range<usize>) -> u64 {
+    let (rows, _) = rows.as_chunks::<LANES>();
+    let (mut most, mut least) = ([K::ZERO; LANES], [K::MAX; LANES]);
+    for row in rows {
+        most.iter_mut().zip(row).for_each(|(m, k)| *m = (*m).max(*k));
+    }
+    for row in &rows[queries] {
+        least.iter_mut().zip(row).for_each(|(m, k)| *m = (*m).min(*k));
+    }
+    (0..LANES).fold(0, |busy, lane| busy | u64::from(most[lane] > least[lane]) << lane)
 }
 
 /// Longest reach whose answers are bytes.
@@ -174,7 +208,7 @@ const SHORT: usize = u8::MAX as usize;
 #[cfg(target_arch = "x86_64")]
 const BEYOND: usize = 8;
 
-/// [`both`] by vectors, with answers left as bytes; false if there is no kernel for it and nothing was done.
+/// [`both`] by vectors, with answers left as bytes; `None` if there is no kernel for it and nothing was done.
 #[cfg(target_arch = "x86_64")]
 #[allow(clippy::too_many_arguments)]
 fn short_answers<K: Key, H: Hit>(
@@ -186,23 +220,26 @@ fn short_answers<K: Key, H: Hit>(
     hits: &mut [&mut [H]; 2],
     rows: &mut [K],
     turned: &mut [u8],
-) -> bool {
+) -> Option<u64> {
     if level == Level::Avx512 {
         let hits = hits.each_mut().map(|h| H::bytes(h));
         // SAFETY: the level says that the CPU has AVX-512.
-        unsafe { super::wide::next_greater(sheet, spans, queries, reach, hits, turned) };
-        return true;
+        return Some(unsafe { super::wide::next_greater(sheet, spans, queries, reach, hits, turned) });
     }
     if reach * size_of::<K>() > BRUTE {
-        return false;
+        return None;
     }
     let rows = &mut rows[..sheet.planes.len() * LANES];
     sheet.copy_to(rows);
+    let busy = busy(level, rows, queries.clone());
+    // Lanes that somebody asks for and that can be occluded.
+    let live = spans.iter().enumerate().fold(busy, |m, (lane, [from, end])| m & !(u64::from(from >= end) << lane));
     let asked = hits.iter_mut().enumerate().filter(|(_, hits)| !hits.is_empty());
     // A kernel is there for both senses or for none.
-    asked.fold(true, |all, (way, hits)| {
-        all && super::narrow::brute(level, rows, queries.clone(), reach, way == 0, H::bytes(hits))
-    })
+    let done = asked.fold(true, |all, (way, hits)| {
+        all && super::narrow::brute(level, rows, live, queries.clone(), reach, way == 0, H::bytes(hits))
+    });
+    done.then_some(busy)
 }
 
 /// Goes on from `short` to `reach` planes for the lanes that are open so far.

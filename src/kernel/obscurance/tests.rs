@@ -1,10 +1,14 @@
 //! The sweep against the definition, closed forms, and what must not change it.
 
+use super::keys::LANES;
 use super::reference::{Field, missing, obscurance, occluder};
 use super::*;
 use crate::brick::Scratch;
 use crate::grid::Voxel;
 use crate::stage::directions;
+
+mod masked;
+mod streamed;
 
 fn params() -> ObscuranceParams {
     ObscuranceParams {
@@ -40,6 +44,10 @@ struct Result {
     rgb: [Vec<f32>; 3],
 }
 
+fn interleave(c: &[Vec<f32>; 3]) -> Vec<[f32; 4]> {
+    (0..c[0].len()).map(|i| [c[0][i], c[1][i], c[2][i], f32::NAN]).collect()
+}
+
 /// Sweeps `out` of a volume, giving the kernel only the halo that it asks for.
 fn sweep_part<T: Voxel>(
     level: Level,
@@ -56,7 +64,7 @@ where
     let src_box = out.grow(prepared.reach()).clip(&field.region);
     let part = |data: &[f32], r: Region| -> Vec<f32> { r.iter().map(|q| data[field.index(q).unwrap()]).collect() };
     let src: Vec<T> = src_box.iter().map(|q| field.data[field.index(q).unwrap()]).collect();
-    let colours = colour.map(|c| [0, 1, 2].map(|k| part(&c[k], src_box)));
+    let colours = colour.map(|c| interleave(&[0, 1, 2].map(|k| part(&c[k], src_box))));
     let normals = gradient.map(|c| [0, 1, 2].map(|k| part(&c[k], out)));
     let (n, shape) = (out.voxels(), out.shape());
     let mut openness = vec![-1f32; n];
@@ -64,8 +72,9 @@ where
     let mut scratch = Scratch::new();
     let asked = prepared.scratch_bytes(T::DTYPE, src_box.shape(), shape, colour.is_some(), gradient.is_some());
     let io = ObscuranceIo {
-        colour: colours.as_ref().map(|c| [0, 1, 2].map(|k| View::dense(&c[k], src_box.shape()))),
+        colour: colours.as_ref().map(|c| View::dense(&c[..], src_box.shape())),
         normal: normals.as_ref().map(|c| [0, 1, 2].map(|k| View::dense(&c[k], shape))),
+        needed: None,
         openness: Some(AnyViewMut::F32(ViewMut::dense(&mut openness, shape))),
         rgb: colour.is_some().then(|| rgb.each_mut().map(|v| AnyViewMut::F32(ViewMut::dense(v, shape)))),
     };

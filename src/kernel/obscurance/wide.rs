@@ -28,7 +28,7 @@ pub(super) fn scratch_bytes(planes: usize, queries: usize, size: usize) -> usize
     lines + tables + answers
 }
 
-/// Answers of both senses; see [`super::scan::both`]. An empty slice of hits is a sense that is not asked for.
+/// Answers of both senses and the lanes in which there can be any; see [`super::scan::both`]. An empty slice of hits is a sense that is not asked for.
 /// Panics if `reach` is beyond [`MAX_REACH`] or the scratch is shorter than [`scratch_bytes`].
 ///
 /// # Safety
@@ -41,7 +41,7 @@ pub(super) unsafe fn next_greater<K: Key>(
     reach: usize,
     hits: [&mut [u8]; 2],
     scratch: &mut [u8],
-) {
+) -> u64 {
     let planes = sheet.planes.len();
     assert!(reach <= MAX_REACH && queries.end <= planes);
     assert!(scratch.len() >= scratch_bytes(planes, queries.len(), size_of::<K>()));
@@ -321,14 +321,14 @@ macro_rules! search {
             reach: usize,
             hits: [&mut [u8]; 2],
             scratch: &mut [u8],
-        ) {
+        ) -> u64 {
             /// Keys of a register, and of a block of a line.
             const R: usize = 64 / size_of::<$t>();
             // SAFETY: the caller's promise.
             let busy = unsafe { $busy(data, starts, queries.clone()) };
             if busy == 0 || reach == 0 {
                 hits.into_iter().for_each(|hits| hits.fill(reach as u8));
-                return;
+                return if reach == 0 { 0 } else { busy };
             }
             let planes = starts.len();
             // Blocks are counted so that the first query starts one.
@@ -370,6 +370,9 @@ macro_rules! search {
             for line in 0..LANES {
                 let [from, end] = spans[line].map(|query| (query as usize).min(queries.len()));
                 if from >= end {
+                    for answers in [&mut *answers_f, &mut *answers_b] {
+                        answers[line * answer_stride..][..answer_stride].fill(reach as u8);
+                    }
                     continue;
                 }
                 let asked = from / R..end.div_ceil(R);
@@ -377,6 +380,11 @@ macro_rules! search {
                     true => answers[line * answer_stride..][..answer_stride].as_mut_ptr(),
                     false => std::ptr::null_mut(),
                 };
+                let unasked = [0..asked.start * R, (asked.end * R).min(answer_stride)..answer_stride];
+                for answers in [&mut *answers_f, &mut *answers_b] {
+                    let line = &mut answers[line * answer_stride..][..answer_stride];
+                    unasked.iter().for_each(|part| line[part.clone()].fill(reach as u8));
+                }
                 let answers = [place(0, answers_f), place(1, answers_b)];
                 if busy >> line & 1 == 0 {
                     for to in answers.into_iter().filter(|to| !to.is_null()) {
@@ -401,6 +409,7 @@ macro_rules! search {
                     unsafe { turn_back(answers.as_ptr(), answer_stride, queries.len(), hits) };
                 }
             }
+            busy
         }
     };
 }

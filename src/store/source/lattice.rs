@@ -79,7 +79,9 @@ impl Lattice {
         Some(ends)
     }
 
-    /// Copies the box into `dst`, which has its shape and the lattice's type. Returns the bytes taken.
+    /// Copies the box into `dst`, which has its shape and the lattice's type. Returns the bytes taken. Pages of mapped files
+    /// are let go behind it unless they are to be kept.
+    #[allow(clippy::too_many_arguments)]
     pub fn read(
         &self,
         level: Level,
@@ -87,6 +89,7 @@ impl Lattice {
         component: usize,
         region: Region,
         mut dst: AnyViewMut,
+        keep: bool,
     ) -> Result<u64> {
         if region.is_empty() {
             return Ok(0);
@@ -100,7 +103,7 @@ impl Lattice {
         for z in region.lo[0]..region.hi[0] {
             let (file, start) = self.plane_at(component, z as usize);
             front = match front {
-                Some((f, lo, hi)) if f == file && hi.max(start + span) - lo.min(start) <= MAPPED => {
+                Some((f, lo, hi)) if keep || f == file && hi.max(start + span) - lo.min(start) <= MAPPED => {
                     Some((f, lo.min(start), hi.max(start + span)))
                 }
                 behind => {
@@ -116,7 +119,7 @@ impl Lattice {
                 Ok(())
             })?;
         }
-        front.into_iter().for_each(|(f, lo, hi)| files.forget(f, lo, hi));
+        front.into_iter().filter(|_| !keep).for_each(|(f, lo, hi)| files.forget(f, lo, hi));
         Ok(region.voxels() as u64 * size)
     }
 
@@ -223,7 +226,7 @@ mod tests {
         for level in Level::available() {
             let region = Region::new([1, 0, 2], [3, 4, 5]);
             let mut out = Voxels::zeroed(DType::U16, region.voxels());
-            let taken = lattice.read(level, &files, 0, region, out.view_mut(region.shape())).unwrap();
+            let taken = lattice.read(level, &files, 0, region, out.view_mut(region.shape()), false).unwrap();
             assert_eq!(taken, region.voxels() as u64 * 2);
             for (i, [z, y, x]) in region.iter().enumerate() {
                 assert_eq!(out.at(i), (z * 100 + y * 10 + x) as f64);

@@ -143,7 +143,17 @@ impl Source {
     /// Fills `dst` (shape and stored type of the box) with stored values; float nodata becomes NaN. Returns the bytes read
     /// from storage. Sources with chunks decode every chunk that the box touches: [`Source::read_chunk`] lets the caller
     /// keep them.
-    pub fn read(&self, component: usize, region: Region, mut dst: AnyViewMut) -> Result<u64> {
+    pub fn read(&self, component: usize, region: Region, dst: AnyViewMut) -> Result<u64> {
+        self.read_box(component, region, dst, false)
+    }
+
+    /// As [`Source::read`] for boxes that overlap what will be read soon: pages of mapped files stay until
+    /// [`Source::release`].
+    pub fn read_again(&self, component: usize, region: Region, dst: AnyViewMut) -> Result<u64> {
+        self.read_box(component, region, dst, true)
+    }
+
+    fn read_box(&self, component: usize, region: Region, mut dst: AnyViewMut, keep: bool) -> Result<u64> {
         let inside = Region::whole(self.info.shape).contains(&region) && component < self.info.components;
         if !inside || dst.shape() != region.shape() || dst.dtype() != self.info.dtype {
             return Err(Error::Failed(format!(
@@ -156,9 +166,9 @@ impl Source {
             )));
         }
         let bytes = match &self.kind {
-            Kind::Planar(planar) => planar.read(self.level, component, region, reborrow(&mut dst))?,
+            Kind::Planar(planar) => planar.read(self.level, component, region, reborrow(&mut dst), keep)?,
             Kind::Zarr(array) => match &self.flat {
-                Some(Some(planes)) => planes.read(self.level, component, region, reborrow(&mut dst))?,
+                Some(Some(planes)) => planes.read(self.level, component, region, reborrow(&mut dst), keep)?,
                 _ => array.read(component, region, &self.info, reborrow(&mut dst))?,
             },
             Kind::Synthetic(field) => {

@@ -97,12 +97,13 @@ impl Planar {
         Ok(())
     }
 
-    pub fn read(&self, level: Level, component: usize, region: Region, dst: AnyViewMut) -> Result<u64> {
+    /// See [`super::Source::read`] and [`super::Source::read_again`].
+    pub fn read(&self, level: Level, component: usize, region: Region, dst: AnyViewMut, keep: bool) -> Result<u64> {
         let files = self
             .files
             .as_ref()
             .ok_or_else(|| Error::Failed("a packed input was read before it was unpacked".into()))?;
-        self.lattice.read(level, files, component, region, dst)
+        self.lattice.read(level, files, component, region, dst, keep)
     }
 
     /// See [`super::Source::identity`].

@@ -1,0 +1,275 @@
+//! Config and volume facts to a pruned graph: names become indices, lengths become voxels, stages that share a pass share
+//! a step.
+
+mod openness;
+mod ops;
+mod steps;
+
+use std::collections::HashMap;
+
+use super::graph::*;
+use super::{Prepass, lengths};
+use crate::config::{Config, Input, Modulation, Op, Place, Ref, StageNode, op_channels};
+use crate::grid::Border;
+use crate::kernel::gaussian;
+use crate::store::VolumeInfo;
+use crate::{Error, Result};
+use ops::box_channel;
+
+/// What lowering makes.
+#[derive(Debug, Default)]
+pub struct Lowered {
+    pub graph: Graph,
+    pub prepasses: Vec<Prepass>,
+    /// Occlusion maps by stage index: the wire they read and the level of their dataset 0.
+    pub maps: HashMap<usize, (WireId, usize)>,
+}
+
+struct Lowering<'a> {
+    config: &'a Config,
+    infos: &'a [VolumeInfo],
+    out: Lowered,
+    /// Channels that somebody reads, per stage.
+    wanted: Vec<Vec<&'static str>>,
+    input_wires: HashMap<usize, WireId>,
+    stage_wires: HashMap<(usize, &'static str), WireId>,
+}
+
+/// What a name of the config means.
+enum Target {
+    Input(usize),
+    Stage(usize, &'static str),
+}
+
+/// Lowers everything that the outputs read. `infos` are the facts of the config's inputs, in order.
+pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
+    let mut lowering = Lowering {
+        config,
+        infos,
+        out: Lowered::default(),
+        wanted: vec![Vec::new(); config.stages.len()],
+        input_wires: HashMap::new(),
+        stage_wires: HashMap::new(),
+    };
+    for output in &config.outputs {
+        for from in &output.from {
+            lowering.want(from, &output.place)?;
+        }
+    }
+    let stages: Vec<usize> = (0..config.stages.len()).filter(|&s| !lowering.wanted[s].is_empty()).collect();
+    for stage in stages {
+        lowering.stage(stage)?;
+    }
+    // Inputs that outputs read directly.
+    for output in &config.outputs {
+        for from in &output.from {
+            if let Target::Input(input) = lowering.target(from, &output.place)? {
+                lowering.input(input)?;
+            }
+        }
+    }
+    lowering.out.graph.demand_halos();
+    Ok(lowering.out)
+}
+
+impl Lowered {
+    /// The wire of a reference; `None` for an occlusion map's channels, which are pyramids of their own.
+    pub fn wire_of(&self, config: &Config, reference: &Ref) -> Option<WireId> {
+        let name = match config.stages.iter().find(|s| s.name == reference.name) {
+            Some(stage) => {
+                let channel = reference.channel.as_deref().unwrap_or(op_channels(stage.op.word())[0]);
+                format!("{}.{channel}", stage.name)
+            }
+            None => reference.name.clone(),
+        };
+        self.graph.wires.iter().position(|w| w.name == name)
+    }
+}
+
+impl Lowering<'_> {
+    fn error(&self, place: &Place, message: impl std::fmt::Display) -> Error {
+        Error::config(place.key.clone(), message).located(&self.config.file, place.line)
+    }
+
+    fn target(&self, reference: &Ref, place: &Place) -> Result<Target> {
+        if let Some(input) = self.config.inputs.iter().position(|i| i.name == reference.name) {
+            return Ok(Target::Input(input));
+        }
+        let Some(stage) = self.config.stages.iter().position(|s| s.name == reference.name) else {
+            return Err(self.error(place, format!("there is no input or stage named \"{}\"", reference.name)));
+        };
+        let channels = op_channels(self.config.stages[stage].op.word());
+        let wanted = reference.channel.as_deref().unwrap_or(channels[0]);
+        match channels.iter().find(|c| **c == wanted) {
+            Some(channel) => Ok(Target::Stage(stage, channel)),
+            None => Err(self.error(
+                place,
+                format!("stage \"{}\" has no channel \"{wanted}\"; it has {}", reference.name, channels.join(", ")),
+            )),
+        }
+    }
+
+    /// Marks a channel as read, and what its stage reads in turn.
+    fn want(&mut self, reference: &Ref, place: &Place) -> Result<()> {
+        let Target::Stage(stage, channel) = self.target(reference, place)? else { return Ok(()) };
+        let first = self.wanted[stage].is_empty();
+        let first_rgb = channel == "rgb" && !self.wanted[stage].contains(&channel);
+        if !self.wanted[stage].contains(&channel) {
+            self.wanted[stage].push(channel);
+        }
+        // Levels of a variance pool the means as well.
+        let companion = ["variance", "std"].contains(&channel)
+            && op_channels(self.config.stages[stage].op.word()).contains(&"mean");
+        if companion && !self.wanted[stage].contains(&"mean") {
+            self.wanted[stage].push("mean");
+        }
+        let node = &self.config.stages[stage];
+        for (key, input) in node.reads() {
+            // A colour bleeds into the channel rgb alone.
+            let unseen = if key == "colour" { first_rgb } else { first };
+            if unseen {
+                self.want(input, &node.place)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn wire(&mut self, reference: &Ref, place: &Place) -> Result<WireId> {
+        match self.target(reference, place)? {
+            Target::Input(input) => self.input(input),
+            Target::Stage(stage, channel) => {
+                self.stage(stage)?;
+                self.stage_wires.get(&(stage, channel)).copied().ok_or_else(|| {
+                    self.error(
+                        place,
+                        format!("\"{}\" is an occlusion map: it can be written, not read by a stage", reference.name),
+                    )
+                })
+            }
+        }
+    }
+
+    fn input(&mut self, input: usize) -> Result<WireId> {
+        if let Some(wire) = self.input_wires.get(&input) {
+            return Ok(*wire);
+        }
+        let (node, info): (&Input, &VolumeInfo) = (&self.config.inputs[input], &self.infos[input]);
+        let lattice =
+            Lattice { input, shape: info.shape, spacing: info.spacing, origin: info.origin, unit: info.unit.clone() };
+        self.out.graph.lattices.push(lattice);
+        let missing = info.nodata.filter(|_| !info.dtype.is_float()).filter(|v| v.fract() == 0.0 && v.abs() < 1e15);
+        let wire = Wire {
+            name: node.name.clone(),
+            channel: "value".into(),
+            producer: Producer::Input(input),
+            components: info.components,
+            component_names: info.component_names.clone(),
+            dtype: info.dtype,
+            affine: info.affine,
+            missing: missing.map(|v| v as i64),
+            fill: missing.unwrap_or(0.0),
+            lattice: self.out.graph.lattices.len() - 1,
+            halo: [0; 3],
+        };
+        let id = self.push_wire(wire);
+        self.input_wires.insert(input, id);
+        Ok(id)
+    }
+
+    fn push_wire(&mut self, wire: Wire) -> WireId {
+        self.out.graph.wires.push(wire);
+        self.out.graph.wires.len() - 1
+    }
+
+    /// Lowers one stage (once), after those that it reads.
+    fn stage(&mut self, index: usize) -> Result<()> {
+        let wanted = self.wanted[index].clone();
+        if self.stage_wires.contains_key(&(index, wanted[0])) || self.out.maps.contains_key(&index) {
+            return Ok(());
+        }
+        let node = self.config.stages[index].clone();
+        self.lower_op(index, &node, &wanted)
+            .map_err(|e| self.config.locate(e).located(&self.config.file, node.place.line))
+    }
+
+    fn lower_op(&mut self, index: usize, node: &StageNode, wanted: &[&'static str]) -> Result<()> {
+        let place = &node.place;
+        let key = |k: &str| format!("{}.{k}", place.key);
+        match &node.op {
+            Op::Box { input, radius } => {
+                let src = self.wire(input, place)?;
+                let radius = lengths::radius(radius, self.lattice(src), &key("radius"))?;
+                self.check_window(src, radius, node.border, &key("radius"))?;
+                let channels = wanted.iter().map(|c| (*c, box_channel(c))).collect();
+                self.window(index, node, src, radius, false, channels)
+            }
+            Op::AmbientOcclusion { .. } => self.openness(index, node, wanted),
+            Op::Gaussian { input, sigma } => {
+                let src = self.wire(input, place)?;
+                let sigma = lengths::sigma(sigma, self.lattice(src), &key("sigma"))?;
+                let channels =
+                    wanted.iter().map(|c| if *c == "mean" { Moment::Mean } else { Moment::Variance }).collect();
+                let kind = StepKind::Gaussian { sigma, channels };
+                self.push_step(index, node, kind, vec![src], gaussian::reach(sigma), node.border, wanted)
+            }
+            Op::OcclusionMap { input, start_level } => {
+                let src = self.wire(input, place)?;
+                if node.where_.is_some() {
+                    return Err(Error::config(
+                        key("where"),
+                        "an occlusion_map takes no `where`: its levels pool every voxel",
+                    ));
+                }
+                self.out.maps.insert(index, (src, *start_level));
+                Ok(())
+            }
+            Op::Gradient { input, size, weight } => {
+                let src = self.wire(input, place)?;
+                let channels = wanted
+                    .iter()
+                    .map(|c| if *c == "magnitude" { GradientChannel::Magnitude } else { GradientChannel::Vector })
+                    .collect();
+                let kind = self.gradient_kind(src, *size, *weight, channels);
+                self.push_step(index, node, kind, vec![src], [size / 2; 3], Border::Nearest, wanted)
+            }
+            Op::Saliency { input, size, weight, scale_max } => {
+                self.saliency(index, node, input, *size, *weight, *scale_max)
+            }
+            Op::Obscurance(op) => self.obscurance(index, node, op, wanted),
+            Op::Transfer { input, points } => {
+                let src = self.wire(input, place)?;
+                let channels = wanted
+                    .iter()
+                    .map(|c| if *c == "opacity" { TransferChannel::Opacity } else { TransferChannel::Rgb })
+                    .collect();
+                let kind = StepKind::Transfer { points: points.clone(), channels };
+                self.push_step(index, node, kind, vec![src], [0; 3], Border::Clip, wanted)
+            }
+            Op::Window { input, low, high, mode } => {
+                let src = self.wire(input, place)?;
+                let kind = StepKind::OpennessWindow { low: *low, high: *high, mode: *mode };
+                self.push_step(index, node, kind, vec![src], [0; 3], Border::Clip, wanted)
+            }
+            Op::OpacityModulation { input, by, rule } => {
+                let inputs = vec![self.wire(input, place)?, self.wire(by, place)?];
+                let kind = match *rule {
+                    Modulation::Variance { sigma_max2 } => StepKind::ModulateByVariance { sigma_max2 },
+                    Modulation::Saliency { threshold, gain } => StepKind::ModulateBySaliency { threshold, gain },
+                };
+                self.push_step(index, node, kind, inputs, [0; 3], Border::Clip, wanted)
+            }
+            Op::AmbientLight { input, rgb, k } => {
+                let inputs = vec![self.wire(input, place)?, self.wire(rgb, place)?];
+                self.push_step(index, node, StepKind::AmbientLight { k: *k }, inputs, [0; 3], Border::Clip, wanted)
+            }
+            Op::Combine { inputs, kind } => {
+                let wires = inputs.iter().map(|r| self.wire(r, place)).collect::<Result<Vec<_>>>()?;
+                self.push_step(index, node, StepKind::Combine { kind: *kind }, wires, [0; 3], Border::Clip, wanted)
+            }
+        }
+    }
+
+    fn lattice(&self, wire: WireId) -> &Lattice {
+        &self.out.graph.lattices[self.out.graph.wires[wire].lattice]
+    }
+}

@@ -1,0 +1,147 @@
+//! Sweeps whose bricks with halos do not fit read the columns of their lines instead: nothing of that shows in the output.
+
+mod common;
+
+use std::path::Path;
+
+use common::*;
+use occlude::plan::Plan;
+use occlude::run::{RunOptions, Session, Silent};
+use occlude::store::open_inputs;
+
+const SHAPE: [usize; 3] = [130, 170, 560];
+
+/// The volume comes as .npy and as Zarr with chunks that are not stored.
+const CONFIG: &str = r#"
+[run]
+memory = "4GiB"
+device = "cpu"
+threads = 2
+[input.vol]
+path = "vol.npy"
+nodata = 7
+[stage.sweep]
+op = "obscurance"
+input = "vol"
+directions = 12
+max_distance = 110
+[output.o]
+path = "o.zarr"
+from = "sweep"
+dtype = "f32"
+"#;
+const COPY: &str = r#"
+[input.vol]
+path = "vol.npy"
+[output.copy]
+path = "vol.zarr"
+from = "vol"
+chunk = 32
+shard = "none"
+levels = 1
+"#;
+/// Budgets at which a box with its halo would be far smaller than a column's.
+const SMALL: [&str; 3] = ["run.memory=44MiB", "run.memory=48MiB", "run.memory=72MiB"];
+
+fn volume() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    // Noise on waves with missing voxels; far to the right nothing, which chunks of the copy leave out.
+    let data = fill(SHAPE, |z, y, x| {
+        if x >= 360 {
+            return 0;
+        }
+        let wave = (z as f64 * 0.07).sin() + (y as f64 * 0.05).cos() + (x as f64 * 0.04).sin();
+        let noise = hash(3, ((z * 1024 + y) * 1024 + x) as u64);
+        if noise.is_multiple_of(31) { 7 } else { (120.0 + 30.0 * wave) as u8 + (noise >> 20) as u8 % 9 }
+    });
+    write_npy(&dir.path().join("vol.npy"), "|u1", SHAPE, &data);
+    run(dir.path(), COPY, &[]);
+    dir
+}
+
+/// Whether a run under these settings reads columns.
+fn streams(dir: &Path, sets: &[&str]) -> bool {
+    let config = parse(dir, CONFIG, sets);
+    let infos: Vec<_> = open_inputs(&config).unwrap().iter().map(|s| s.info().clone()).collect();
+    let plan = Plan::new(&config, &infos, &mut || Err("none".into())).unwrap();
+    plan.graph.steps.iter().any(|s| s.streamed)
+}
+
+#[test]
+fn budgets_threads_bricks_and_sources_never_show() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    assert!(!streams(dir.path(), &[]));
+    run(dir.path(), CONFIG, &[]);
+    let (whole, meta) = (decode(&out), metadata(&out));
+    let zarr = "input.vol.path=vol.zarr";
+    let variants: [&[&str]; 6] = [
+        &[SMALL[0]],
+        &[SMALL[1], "run.threads=1"],
+        &[SMALL[2], "run.threads=3", zarr],
+        &[SMALL[0], zarr],
+        &[SMALL[1], "run.brick=[32, 48, 40]"],
+        &[SMALL[2], "run.brick=[64, 16, 96]", zarr],
+    ];
+    for sets in variants {
+        assert!(streams(dir.path(), sets), "{sets:?}");
+        let report = run(dir.path(), CONFIG, sets);
+        assert_same(&format!("{sets:?}"), &whole, &decode(&out));
+        if !sets.contains(&zarr) {
+            assert_eq!(meta, metadata(&out), "metadata with {sets:?}");
+        }
+        assert!(report.read_amplification > 3.0, "{}", report.read_amplification);
+        // To the right of everything nothing is in reach, or the chunks there are not even stored.
+        let skipped: u64 = report.bricks.skipped.values().sum();
+        assert!(skipped > 0 && report.bricks.computed + skipped == report.bricks.total, "{:?}", report.bricks);
+        let cause = if sets.contains(&zarr) { "missing_chunk" } else { "constant" };
+        assert!(report.bricks.skipped.contains_key(cause), "{:?}", report.bricks);
+        let plain = RunOptions { overwrite: true, no_skip: true, ..Default::default() };
+        let report = run_with(&parse(dir.path(), CONFIG, sets), &plain);
+        assert_eq!(report.bricks.computed, report.bricks.total);
+        assert_same(&format!("{sets:?} without skipping"), &whole, &decode(&out));
+    }
+}
+
+#[test]
+fn a_run_may_go_on_with_boxes_where_columns_began() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    run(dir.path(), CONFIG, &[]);
+    let whole = decode(&out);
+    for (first, second) in [(SMALL[1], "run.memory=4GiB"), ("run.memory=4GiB", SMALL[2])] {
+        let config = parse(dir.path(), CONFIG, &[first]);
+        let options = RunOptions { overwrite: true, ..Default::default() };
+        let session = Session::open(&config, &options, &Silent).unwrap();
+        assert!(session.task_count() > 1);
+        session.run_task(0).unwrap();
+        drop(session);
+        let config = parse(dir.path(), CONFIG, &[second]);
+        let report = run_with(&config, &RunOptions { resume: true, ..Default::default() });
+        assert!(report.bricks.resumed > 0 && report.bricks.resumed < report.bricks.total, "{:?}", report.bricks);
+        assert_same(&format!("{first}, then {second}"), &whole, &decode(&out));
+    }
+}
+
+#[test]
+fn a_region_is_that_part_of_the_whole() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    run(dir.path(), CONFIG, &["output.o.levels=1"]);
+    let whole = decode(&out);
+    let (lo, hi) = ([9, 21, 30], [120, 164, 383]);
+    let region = "run.region=[[9, 120], [21, 164], [30, 383]]";
+    assert!(streams(dir.path(), &[SMALL[1], region]));
+    run(dir.path(), CONFIG, &["output.o.levels=1", SMALL[1], region]);
+    for (name, (shape, part)) in decode(&out) {
+        assert_eq!(shape, [0, 1, 2].map(|a| hi[a] - lo[a]), "{name}");
+        let values = &whole[&name].1;
+        let mut at = part.iter();
+        for z in lo[0]..hi[0] {
+            for y in lo[1]..hi[1] {
+                let row = &values[(z * SHAPE[1] + y) * SHAPE[2]..][lo[2]..hi[2]];
+                assert!(row.iter().zip(at.by_ref()).all(|(a, b)| a == b), "row {z} {y}");
+            }
+        }
+    }
+}
