@@ -1,6 +1,7 @@
 //! The brick's shape from the budget.
 
 use super::Plan;
+use super::graph::Producer;
 use super::memory::{self, brick_bytes, parked_bytes};
 use super::streams;
 use super::tasks::{Group, input_halo};
@@ -136,8 +137,35 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
     let fits = |n: &usize| BrickChoice { in_flight: *n, ..choice.clone() }.alive(plan.workers) <= room;
     choice.in_flight = (1..=memory::in_flight(plan.workers)).rev().find(fits)?;
     choice.cache = memory::cache_bytes(plan, choice.alive(plan.workers), parked);
+    // One brick beyond the workers keeps them busy; more only smooth the flow, and a cache that loses the chunks between two
+    // layers of bricks has them decoded again. 2-core Zen 4 VM, 2026-11-26, mean of radius 5, 1024^3 u8 in chunks of 64^3
+    // under 256 MiB: 695 MiB of 367 read with 4 bricks in flight, 435 with 3.
+    let enough = plan.workers + 1;
+    if choice.in_flight > enough && choice.cache < layer_bytes(plan, group) {
+        choice.in_flight = enough;
+        choice.cache = memory::cache_bytes(plan, choice.alive(plan.workers), parked);
+    }
     choice.amplification = amplification(plan, group, shape);
     Some(choice)
+}
+
+/// Bytes of the chunks of all inputs that two layers of a task's bricks share.
+fn layer_bytes(plan: &Plan, group: &Group) -> u64 {
+    let region = group.region.shape();
+    let one = |&w: &usize| {
+        let wire = &plan.graph.wires[w];
+        let Producer::Input(input) = wire.producer else { return 0 };
+        let Some(chunk) = plan.input_chunks[input] else { return 0 };
+        let halo = input_halo(plan, group, w);
+        let across = |a: usize| {
+            let edge = (group.task[a].min(region[a]) + 2 * halo[a]).min(group.shape[a]);
+            edge.div_ceil(chunk[a]) + 1
+        };
+        let layers = (2 * halo[0]).div_ceil(chunk[0]) + 1;
+        let voxels = layers * across(1) * across(2) * chunk.iter().product::<usize>();
+        (voxels * wire.dtype.size() * wire.components) as u64
+    };
+    group.inputs.iter().map(one).sum()
 }
 
 /// Input voxels read per output voxel, the mean over the group's inputs, halos clipped to the volume.

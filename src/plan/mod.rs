@@ -57,6 +57,8 @@ pub struct Plan {
     pub threads: usize,
     /// Threads that compute bricks: `threads`, or as many as keep the GPU's slots busy, where most of them wait.
     pub workers: usize,
+    /// Chunks of the config's inputs; `None` where any box can be read.
+    pub input_chunks: Vec<Option<crate::grid::Shape>>,
     /// Which stages may give bricks to both lanes.
     pub lanes: Lanes,
     /// Ceiling in bytes.
@@ -90,6 +92,7 @@ impl Plan {
             graph,
             threads,
             workers: if gpu.is_some() { threads.max(facts::SLOTS as usize) } else { threads },
+            input_chunks: infos.iter().map(|i| i.chunk).collect(),
             lanes: config.run.lanes,
             memory: config.run.memory,
             warnings,
