@@ -1,0 +1,121 @@
+//! The normal distribution (A 3.3) and Chebyshev's bounds (E 3.4) from mean and variance.
+
+use super::{Row, exp2, padded};
+use crate::kernel::simd::Level;
+use crate::kernel::singles::{F32x32, SINGLES};
+use crate::kernel::window::estimate::{Code, Polarity, RowSum, Spread};
+
+crate::on_singles! {
+    /// A 3.3 and E 3.4 from the numerators of variances.
+    fn spread_at[T: Code, X1: RowSum, const KIND: usize, const NARROW: bool](
+        row: &Row<T, X1>, numerator: &[f64], polarity: Polarity, scale: f32, out: &mut [f32]
+    ) = spread_inner[T, X1, KIND, NARROW];
+}
+
+const GAUSSIAN: usize = 0;
+const CHEBYSHEV: usize = 1;
+const LITERAL: usize = 2;
+
+/// A 3.3 and E 3.4 of a row with numerators `n^2 variance`.
+pub fn spread_row<T: Code, X1: RowSum>(
+    level: Level,
+    kind: Spread,
+    row: &Row<T, X1>,
+    numerator: &[f64],
+    polarity: Polarity,
+    out: &mut [f32],
+) {
+    let len = out.len();
+    if len < SINGLES {
+        let (v, s1, n) = (padded(row.v, len), padded(row.s1, len), padded(row.n, len));
+        let mut all = [0.0; SINGLES];
+        let row = Row { v: &v, s1: &s1, n: &n, ..*row };
+        spread_row(level, kind, &row, &padded(numerator, len), polarity, &mut all);
+        out.copy_from_slice(&all[..len]);
+        return;
+    }
+    // Products of three deviations must stay below 2^128; a power of two changes no rounding.
+    let bits = (row.most as u128 * T::TOP as u128).max(1).ilog2() as i32;
+    let scale = 2f32.powi(-(bits - 38).max(0));
+    macro_rules! go {
+        ($kind:ident) => {
+            match row.narrow() {
+                true => spread_at::<T, X1, $kind, true>(level, row, numerator, polarity, scale, out),
+                false => spread_at::<T, X1, $kind, false>(level, row, numerator, polarity, scale, out),
+            }
+        };
+    }
+    match kind {
+        Spread::Gaussian => go!(GAUSSIAN),
+        Spread::Chebyshev => go!(CHEBYSHEV),
+        Spread::Literal => go!(LITERAL),
+    }
+}
+
+#[inline(always)]
+fn spread_inner<L: F32x32, T: Code, X1: RowSum, const KIND: usize, const NARROW: bool>(
+    row: &Row<T, X1>,
+    numerator: &[f64],
+    polarity: Polarity,
+    scale: f32,
+    out: &mut [f32],
+) {
+    let len = out.len();
+    let (v, s1, n, numerator) = (&row.v[..len], &row.s1[..len], &row.n[..len], &numerator[..len]);
+    assert!(len >= SINGLES);
+    let zero = L::splat(0.0);
+    // What is made below is S1 - n v.
+    let sign = L::splat(if polarity.flipped { scale } else { -scale });
+    blocks!(0, len, |at| {
+        // SAFETY: `at + 32 <= len`, the length of every slice.
+        let d = unsafe {
+            if NARROW {
+                let c = T::codes::<L>(v.as_ptr().add(at), row.flip);
+                let product = L::times_int(L::load_u32(n.as_ptr().add(at)), c);
+                L::of_int(L::less_int(L::load_u32(s1.as_ptr().add(at).cast()), product)) // X1 is u32
+            } else {
+                let mut d = [0f32; SINGLES];
+                for i in 0..SINGLES {
+                    d[i] = s1[at + i].behind(n[at + i], v[at + i].code(row.flip).u32());
+                }
+                L::load(d.as_ptr())
+            }
+        };
+        // SAFETY: as above.
+        let m = unsafe { L::of_f64(numerator.as_ptr().add(at)) };
+        let flat = m.equals(zero);
+        let (d, m) = (d.times(sign), m.times(L::splat(scale * scale)));
+        let constant = L::splat(polarity.constant);
+        let y = if L::all(flat) {
+            constant
+        } else {
+            let y = match KIND {
+                GAUSSIAN => phi(d, m),
+                // 1 - m / (m + d^2) without the cancellation
+                CHEBYSHEV => d.greater(zero).times(d.greater(zero)).over(d.fused(d, m)),
+                _ => L::pick(zero.is_below(d), m.over(d.fused(d, m)), L::splat(1.0)),
+            };
+            L::pick(flat, constant, y)
+        };
+        // SAFETY: as above.
+        unsafe { y.store(out.as_mut_ptr().add(at)) };
+    });
+}
+
+/// The standard normal distribution function of `d / sqrt(m)` by Abramowitz and Stegun 7.1.26, absolute error 4e-7, with one
+/// division: with s = sqrt(m) and u = s + k |d| the quotients `s / u` and `d^2 / m` are multiples of `1 / (m u)`.
+#[inline(always)]
+fn phi<L: F32x32>(d: L, m: L) -> L {
+    const K: f32 = 0.327_591_1 * std::f32::consts::FRAC_1_SQRT_2;
+    let s = m.root();
+    let u = d.magnitude().fused(L::splat(K), s);
+    let inverse = L::splat(1.0).over(m.times(u));
+    let t = s.times(m).times(inverse);
+    let exponent = d.times(d).times(u.times(inverse)).times(L::splat(-0.5 * std::f32::consts::LOG2_E));
+    let square = t.times(t);
+    let low = t.fused(L::splat(-0.284_496_72 * 0.5), L::splat(0.254_829_6 * 0.5));
+    let high = t.fused(L::splat(-1.453_152 * 0.5), L::splat(1.421_413_8 * 0.5));
+    let p = square.fused(L::splat(1.061_405_4 * 0.5), high).fused(square, low).times(t);
+    let tail = p.times(exp2(exponent));
+    L::pick(d.is_below(L::splat(0.0)), tail, L::splat(1.0).minus(tail))
+}
