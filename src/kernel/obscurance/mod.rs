@@ -20,6 +20,7 @@ mod keys;
 mod lines;
 #[cfg(target_arch = "x86_64")]
 mod narrow;
+mod ranks;
 #[cfg(test)]
 mod reference;
 mod room;
@@ -148,13 +149,30 @@ impl Prepared {
         if dst_box.is_empty() {
             return LineCounts::default();
         }
-        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx))
+        let mask = io.needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
+        let (colour, normal) = (io.rgb.is_some(), io.normal.is_some());
+        let most = self.scratch_bytes(src.dtype(), src_box.shape(), dst_box.shape(), colour, normal) + mask;
+        let bytes = cx.scratch.take(most);
+        if let (AnyView::F32(v), None) = (src, self.params.missing) {
+            let (codes, rest) = carve::<u8>(&mut *bytes, src_box.voxels());
+            if ranks::rank(v, codes) {
+                return self.sweep_typed(View::dense(codes, v.shape), src_box, dst_box, io, cx.level, rest);
+            }
+        }
+        with_view!(AnyView, src, v => self.sweep_typed(v, src_box, dst_box, io, cx.level, bytes))
     }
 
     /// Bytes of scratch that [`Self::sweep`] takes at most, apart from [`Self::masked_bytes`].
     pub fn scratch_bytes(&self, dtype: DType, src: Shape, dst: Shape, colour: bool, normal: bool) -> usize {
-        let key = dtype.size();
-        self.sizes(src, dst, colour || normal).bytes(key, colour, normal)
+        let sizes = self.sizes(src, dst, colour || normal);
+        let bytes = sizes.bytes(dtype.size(), colour, normal);
+        match dtype {
+            // Floats of few values are swept as bytes.
+            DType::F32 => {
+                bytes.max(src.iter().product::<usize>().next_multiple_of(64) + sizes.bytes(1, colour, normal))
+            }
+            _ => bytes,
+        }
     }
 
     /// Bytes of scratch that a sweep takes besides where only some voxels are needed.
@@ -189,13 +207,12 @@ impl Prepared {
         src_box: Region,
         dst_box: Region,
         io: ObscuranceIo,
-        cx: &mut Context,
+        level: Level,
+        bytes: &mut [u8],
     ) -> LineCounts {
         let weighted = io.rgb.is_some() || io.normal.is_some();
         let sizes = self.sizes(src_box.shape(), dst_box.shape(), weighted);
         let words = io.needed.map_or([0; 2], |_| self.mask_words(dst_box.shape()));
-        let mask = io.needed.map_or(0, |_| self.masked_bytes(dst_box.shape()));
-        let bytes = cx.scratch.take(sizes.bytes(size_of::<T>(), io.rgb.is_some(), io.normal.is_some()) + mask);
         let (natural_mask, bytes) = carve::<u64>(bytes, words[0]);
         let (turned_mask, bytes) = carve::<u64>(bytes, words[1]);
         let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
@@ -204,7 +221,6 @@ impl Prepared {
 
         let missing = keys::missing_of::<T>(self.params.missing);
         let code = keys::Code { missing, flipped: self.params.flipped };
-        let level = cx.level;
         let most = keys::encode(level, src, code, natural);
         let at = src_box.offset_of(&dst_box);
         // Nothing is greater than any voxel that is asked for.
@@ -215,7 +231,7 @@ impl Prepared {
         };
         let mut pass = Pass {
             prepared: self,
-            level: cx.level,
+            level,
             flat,
             keys: Keys {
                 shared: swapped.is_empty(),

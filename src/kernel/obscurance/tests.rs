@@ -8,6 +8,7 @@ use crate::grid::Voxel;
 use crate::stage::directions;
 
 mod masked;
+mod ranked;
 mod streamed;
 
 fn params() -> ObscuranceParams {
