@@ -69,20 +69,6 @@ fn centre_of(thread: u32) -> Centre {
     return Centre(here, centre, p.n - 1u - centre, p.weights + k * p.radius, k, place);
 }
 
-@compute @workgroup_size(64)
-fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-         @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
-        smooth_at(centre_of(thread), true);
-    }
-}
-
-@compute @workgroup_size(64)
-fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
-        smooth_at(centre_of(thread), false);
-    }
+fn one(thread: u32, first_pass: bool) {
+    smooth_at(centre_of(thread), first_pass);
 }

@@ -36,7 +36,7 @@ struct Pool {
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> weights: array<u32>;
 
-fn pool(thread: u32, packed: bool) {
+fn one(thread: u32, packed: bool) {
     let x = thread % p.out_x;
     let y = (thread / p.out_x) % p.out_y;
     let z = thread / (p.out_x * p.out_y);
@@ -64,22 +64,4 @@ fn pool(thread: u32, packed: bool) {
     output[to] = bitcast<u32>(mean.x);
     output[to + 1u] = bitcast<u32>(mean.y);
     output[to + 2u] = bitcast<u32>(variance);
-}
-
-@compute @workgroup_size(64)
-fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-         @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
-        pool(thread, true);
-    }
-}
-
-@compute @workgroup_size(64)
-fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
-        pool(thread, false);
-    }
 }

@@ -51,20 +51,6 @@ fn line_of(thread: u32) -> Line {
     return Line(i * p.in_i + j * p.in_j, i * p.out_i + j * p.out_j, i32(b));
 }
 
-@compute @workgroup_size(64)
-fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-         @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
-        walk(line_of(thread), true);
-    }
-}
-
-@compute @workgroup_size(64)
-fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
-        walk(line_of(thread), false);
-    }
+fn one(thread: u32, first_pass: bool) {
+    walk(line_of(thread), first_pass);
 }

@@ -1,7 +1,7 @@
 //! A Gaussian mean and the step that reads it, a gradient or windows, in one go: the mean stays on the device. Pure
 //! arithmetic, shared by planner and engine.
 
-use super::passes::{Job, Part, cut};
+use super::passes::{Job, Part, largest, parts_within};
 use super::record::{Buffer, Command, PARAMS_STRIDE, Readback, Recording, Sizes, rounded};
 use super::slopes::{Fit, Input, SlopesJob, WEIGHTS};
 use super::taps::{TapsJob, Wanted};
@@ -149,14 +149,12 @@ impl ChainJob {
 
     /// Parts of which every buffer is at most `cap` bytes; `None` where even one voxel does not fit.
     pub fn parts(&self, cap: u64) -> Option<Vec<ChainPart>> {
-        let boxes = cut(self.reader.dst(), |lo, shape| self.sizes(&self.part(lo, shape)).largest() <= cap)?;
-        Some(boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect())
+        parts_within(self.reader.dst(), cap, |lo, shape| self.part(lo, shape), |p| self.sizes(p))
     }
 
     /// Largest buffers of any part.
     pub fn slot(&self, cap: u64) -> Sizes {
-        let parts = self.parts(cap).unwrap_or_default();
-        parts.iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
+        largest(self.parts(cap), |p| self.sizes(p))
     }
 
     /// The Gaussian's passes, whose results are left on the device, then the second step's.

@@ -1,7 +1,7 @@
 //! Occlusion maps: the chain of levels of a brick recorded, cut into parts that fit. Pure arithmetic, shared by planner and
 //! engine. Boxes are counted from the start of the map's region.
 
-use super::passes::{cut, packed};
+use super::passes::{largest, packed, parts_within};
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Region, Shape};
 use crate::kernel::occlusion_map::{full_weights, needed};
@@ -89,8 +89,7 @@ impl MapJob {
             let hi = |a: usize| at(a, lo[a] + shape[a]).min(brick.hi[a]);
             Region::new(std::array::from_fn(|a| at(a, lo[a])), std::array::from_fn(hi))
         };
-        let boxes = cut(cells, |lo, shape| self.sizes(part(lo, shape)).largest() <= cap)?;
-        Some(boxes.into_iter().map(|(lo, shape)| part(lo, shape)).collect())
+        parts_within(cells, cap, part, |p| self.sizes(*p))
     }
 
     /// Whether a cell of the last level can be made wherever it lies.
@@ -119,8 +118,7 @@ impl MapJob {
 
     /// Largest buffers of any part.
     pub fn slot(&self, brick: Region, cap: u64) -> Sizes {
-        let parts = self.parts(brick, cap).unwrap_or_default();
-        parts.into_iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
+        largest(self.parts(brick, cap), |p| self.sizes(*p))
     }
 
     /// Every level of a part, axis by axis, each read back when it is made.

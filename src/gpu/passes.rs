@@ -179,14 +179,12 @@ impl Job {
     /// Parts of which every buffer is at most `cap` bytes: halves along z first, since cuts there keep rows whole and cost
     /// least. `None` where even one voxel's windows do not fit.
     pub fn parts(&self, cap: u64) -> Option<Vec<Part>> {
-        let boxes = cut(self.dst, |lo, shape| self.sizes(&self.part(lo, shape)).largest() <= cap)?;
-        Some(boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect())
+        parts_within(self.dst, cap, |lo, shape| self.part(lo, shape), |p| self.sizes(p))
     }
 
     /// Largest buffers of any part.
     pub fn slot(&self, cap: u64) -> Sizes {
-        let parts = self.parts(cap).unwrap_or_default();
-        parts.iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
+        largest(self.parts(cap), |p| self.sizes(p))
     }
 
     /// The passes of one quantity over a part: z from packed voxels, then y, then x.
@@ -320,6 +318,23 @@ pub fn stored(dtype: DType) -> Option<Stored> {
         DType::F32 => Some(Stored { voxel: 4, signed: false, real: true }),
         _ => packed(dtype).map(|(voxel, signed)| Stored { voxel, signed, real: false }),
     }
+}
+
+/// Parts of a box, each as `part` makes it of its place and shape, of which every buffer is at most `cap` bytes; `None` where even
+/// one voxel does not fit.
+pub fn parts_within<P>(
+    shape: Shape,
+    cap: u64,
+    part: impl Fn([usize; 3], Shape) -> P,
+    sizes: impl Fn(&P) -> Sizes,
+) -> Option<Vec<P>> {
+    let boxes = cut(shape, |lo, shape| sizes(&part(lo, shape)).largest() <= cap)?;
+    Some(boxes.into_iter().map(|(lo, shape)| part(lo, shape)).collect())
+}
+
+/// Largest buffers of any part.
+pub fn largest<P>(parts: Option<Vec<P>>, sizes: impl Fn(&P) -> Sizes) -> Sizes {
+    parts.unwrap_or_default().iter().map(sizes).fold(Sizes::default(), Sizes::max)
 }
 
 /// Boxes (first voxel, extent) that tile `shape` and fit: halves along z first. `None` where even one voxel does not fit.

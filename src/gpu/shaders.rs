@@ -49,18 +49,24 @@ impl Shader {
 
     fn composed(self) -> Composed {
         match self {
-            Shader::Extremes => composed!("common", "window_pass", "window_herk", "window_kept", "window_extremes"),
-            Shader::Sums32 => composed!("common", "window_pass", "window_sums", "window_sums32"),
-            Shader::Sums64 => composed!("common", "window_pass", "window_sums", "window_sums64"),
-            Shader::Obscurance => composed!("common", "obscurance"),
-            Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian"),
-            Shader::Gradient => composed!("common", "gradient"),
-            Shader::Order => composed!("common", "window_pass", "window_herk", "window_kept", "window_order"),
-            Shader::Moments => composed!("common", "floats", "pairs", "window_pass", "window_herk", "window_moments"),
-            Shader::GaussianVariance => {
-                composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_variance")
+            Shader::Extremes => {
+                composed!("common", "entries", "window_pass", "window_herk", "window_kept", "window_extremes")
             }
-            Shader::MapPool => composed!("common", "floats", "pairs", "cells", "map_pool"),
+            Shader::Sums32 => composed!("common", "entries", "window_pass", "window_sums", "window_sums32"),
+            Shader::Sums64 => composed!("common", "entries", "window_pass", "window_sums", "window_sums64"),
+            Shader::Obscurance => composed!("common", "obscurance"),
+            Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian"),
+            Shader::Gradient => composed!("common", "gradient"),
+            Shader::Order => {
+                composed!("common", "entries", "window_pass", "window_herk", "window_kept", "window_order")
+            }
+            Shader::Moments => {
+                composed!("common", "floats", "pairs", "entries", "window_pass", "window_herk", "window_moments")
+            }
+            Shader::GaussianVariance => {
+                composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian_variance")
+            }
+            Shader::MapPool => composed!("common", "floats", "pairs", "cells", "entries", "map_pool"),
             Shader::Finish => composed!("common", "floats", "pairs", "window_finish"),
         }
     }

@@ -1,7 +1,7 @@
 //! Gradients: how a brick is cut into parts that fit the device, the table of weights, and the one dispatch. Pure
 //! arithmetic, shared by planner and engine.
 
-use super::passes::{Part, cut, stored};
+use super::passes::{Part, largest, parts_within, stored};
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Shape};
 use crate::kernel::gradient::shared::{self, Along};
@@ -130,14 +130,12 @@ impl SlopesJob {
 
     /// Parts of which every buffer is at most `cap` bytes; `None` where even one voxel does not fit.
     pub fn parts(&self, cap: u64) -> Option<Vec<Part>> {
-        let boxes = cut(self.dst, |lo, shape| self.sizes(&self.part(lo, shape)).largest() <= cap)?;
-        Some(boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect())
+        parts_within(self.dst, cap, |lo, shape| self.part(lo, shape), |p| self.sizes(p))
     }
 
     /// Largest buffers of any part.
     pub fn slot(&self, cap: u64) -> Sizes {
-        let parts = self.parts(cap).unwrap_or_default();
-        parts.iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
+        largest(self.parts(cap), |p| self.sizes(p))
     }
 
     pub fn record(&self, part: &Part) -> Recording {

@@ -1,7 +1,7 @@
 //! Gaussian means and variances: how a brick is cut into parts that fit the device, the table of weights, and one pass per
 //! axis of each. Pure arithmetic, shared by planner and engine.
 
-use super::passes::{Part, cut, packed};
+use super::passes::{Part, largest, packed, parts_within};
 use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
 use crate::grid::{DType, Shape};
 use crate::kernel::gaussian;
@@ -99,14 +99,12 @@ impl TapsJob {
 
     /// Parts of which every buffer is at most `cap` bytes; `None` where even one voxel does not fit.
     pub fn parts(&self, cap: u64) -> Option<Vec<Part>> {
-        let boxes = cut(self.dst, |lo, shape| self.sizes(&self.part(lo, shape)).largest() <= cap)?;
-        Some(boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect())
+        parts_within(self.dst, cap, |lo, shape| self.part(lo, shape), |p| self.sizes(p))
     }
 
     /// Largest buffers of any part.
     pub fn slot(&self, cap: u64) -> Sizes {
-        let parts = self.parts(cap).unwrap_or_default();
-        parts.iter().map(|p| self.sizes(p)).fold(Sizes::default(), Sizes::max)
+        largest(self.parts(cap), |p| self.sizes(p))
     }
 
     /// Where the results of a moment stand among those that come back.

@@ -48,23 +48,12 @@ pub fn levels(
     }
     let bytes = cx.scratch.take(scratch_bytes(src.dtype(), from, to, params));
     let radius: [usize; 3] = std::array::from_fn(|a| params.radius[a].min(from[a] - 1));
-    for cell in crate::grid::Region::whole(to).cells([0; 3], TILE).iter() {
-        let lo: [usize; 3] = std::array::from_fn(|a| cell[a] as usize * TILE[a]);
-        let size: Shape = std::array::from_fn(|a| TILE[a].min(to[a] - lo[a]));
-        let first: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a]).saturating_sub(radius[a]));
-        let last: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a] + size[a] + radius[a]).min(from[a]));
-        let tile = Tile {
-            src: std::array::from_fn(|a| last[a] - first[a]),
-            dst: size,
-            at: std::array::from_fn(|a| at[a] + lo[a] - first[a]),
-            radius,
-        };
-        with_view!(AnyView, src, v => {
-            let part = v.part(first, tile.src);
-            let table = Table::new(levels, params.flipped());
-            one_tile(cx.level, part, missing_as(params.missing), &table, &tile, ties, bytes, lo, &mut dst);
-        });
-    }
+    with_view!(AnyView, src, v => {
+        let (table, missing) = (Table::new(levels, params.flipped()), missing_as(params.missing));
+        for (lo, first, tile) in Tile::all(from, to, at, radius, TILE) {
+            one_tile(cx.level, v.part(first, tile.src), missing, &table, &tile, ties, bytes, lo, &mut dst);
+        }
+    });
 }
 
 /// Bytes of scratch that [`levels`] takes at most.

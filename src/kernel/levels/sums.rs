@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use crate::grid::Shape;
+use crate::grid::{Region, Shape};
 use crate::kernel::simd::Level;
 use crate::multiversion;
 
@@ -29,6 +29,26 @@ pub(crate) struct Tile {
 }
 
 impl Tile {
+    /// Tiles of `step` voxels, clipped, of the output box of shape `to` at voxel `at` of a source of shape `from`, each with its
+    /// first voxel in the output box and the first that its windows see in the source.
+    pub fn all(
+        from: Shape,
+        to: Shape,
+        at: [usize; 3],
+        radius: [usize; 3],
+        step: Shape,
+    ) -> impl Iterator<Item = ([usize; 3], [usize; 3], Tile)> {
+        let cells = Region::whole(to).cells([0; 3], step).iter();
+        cells.map(move |cell| {
+            let lo: [usize; 3] = std::array::from_fn(|a| cell[a] as usize * step[a]);
+            let dst: Shape = std::array::from_fn(|a| step[a].min(to[a] - lo[a]));
+            let first: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a]).saturating_sub(radius[a]));
+            let last: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a] + dst[a] + radius[a]).min(from[a]));
+            let src = std::array::from_fn(|a| last[a] - first[a]);
+            (lo, first, Tile { src, dst, at: std::array::from_fn(|a| at[a] + lo[a] - first[a]), radius })
+        })
+    }
+
     /// Planes, rows or columns of the window about output voxel `i`.
     #[inline(always)]
     pub fn window(&self, axis: usize, i: usize) -> Range<usize> {

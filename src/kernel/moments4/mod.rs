@@ -18,7 +18,7 @@ use super::levels::sums::Tile;
 use super::simd::Level;
 use super::values::missing_as;
 use crate::brick::scratch::{cut, padded};
-use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut, Voxel};
+use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, ViewMut, Voxel};
 use crate::stage::{Bound, Ties, WindowParams};
 use rows::{Count, GROUP, Group, bound_group};
 use sums::{Code, Sums, sweep};
@@ -62,18 +62,7 @@ pub fn moments4(
     }
     let bytes = cx.scratch.take(scratch_bytes(src.dtype(), from, to, params));
     let radius: [usize; 3] = std::array::from_fn(|a| params.radius[a].min(from[a] - 1));
-    let step = tile_shape(radius, to);
-    for cell in Region::whole(to).cells([0; 3], step).iter() {
-        let lo: [usize; 3] = std::array::from_fn(|a| cell[a] as usize * step[a]);
-        let size: Shape = std::array::from_fn(|a| step[a].min(to[a] - lo[a]));
-        let first: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a]).saturating_sub(radius[a]));
-        let last: [usize; 3] = std::array::from_fn(|a| (at[a] + lo[a] + size[a] + radius[a]).min(from[a]));
-        let tile = Tile {
-            src: std::array::from_fn(|a| last[a] - first[a]),
-            dst: size,
-            at: std::array::from_fn(|a| at[a] + lo[a] - first[a]),
-            radius,
-        };
+    for (lo, first, tile) in Tile::all(from, to, at, radius, tile_shape(radius, to)) {
         let mut job = Job { level: cx.level, tile: &tile, count: Count { ties, flipped: params.flipped() }, lo, outs };
         let missing = params.missing;
         match src {

@@ -3,6 +3,7 @@
 use super::*;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::Affine;
+use crate::grid::Region;
 use crate::kernel::hostile::{Noise, SHAPES, constant, volume};
 use crate::kernel::levels::Levels;
 use crate::kernel::rank::rank;

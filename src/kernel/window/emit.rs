@@ -16,7 +16,7 @@ pub struct IntRow<'a, T, X1, X2> {
     pub s1: &'a [X1],
     pub s2: &'a [X2],
     pub n: &'a [u32],
-    /// 1 / n, rounded.
+    /// 1 / n, rounded; anything unless the emitter [`Emit::divides`].
     pub inverse: &'a [f64],
     /// Most voxels in a window.
     pub most: u64,
@@ -54,6 +54,12 @@ impl<'a, 'b> Emit<'a, 'b> {
         padded::<f32>(width) + 3 * padded::<f64>(width)
     }
 
+    /// Whether a channel divides by counts, and [`IntRow::inverse`] is read.
+    pub fn divides(&self) -> bool {
+        use WindowChannel::{Mean, Moment2, Std, Variance};
+        self.wants(|c| matches!(c, Mean | Variance | Std | Moment2))
+    }
+
     fn wants(&self, f: impl Fn(WindowChannel) -> bool) -> bool {
         self.outs.iter().any(|o| f(o.channel))
     }
@@ -78,7 +84,7 @@ impl<'a, 'b> Emit<'a, 'b> {
             }
         }
         if self.wants(|c| matches!(c, WindowChannel::Mean | WindowChannel::Moment2)) {
-            let exact = setup.job.counts().0 as u128 * (T::TOP as u128) < 1 << 52;
+            let exact = row.most as u128 * (T::TOP as u128) < 1 << 52;
             estimate::mean_row(level, row.s1, row.n, row.inverse, offset, exact, &mut self.mean[..len]);
         }
         let affine = self.params.affine;

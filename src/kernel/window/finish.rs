@@ -108,7 +108,8 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
     let (lo, hi) = (cut::<T>(bytes, most), cut::<T>(bytes, most));
     let (n, columns) = (cut::<u32>(bytes, most), cut::<u32>(bytes, most));
     let inverse = cut::<f64>(bytes, most);
-    let width = Width::of(job.counts().0, T::TOP);
+    let (voxels, divides) = (job.counts().0, emit.divides());
+    let width = Width::of(voxels, T::TOP);
     let [nz, ny, nx] = part.shape;
     for x in (0..nx).step_by(most) {
         let len = most.min(nx - x);
@@ -119,7 +120,9 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
             let from = (z * ny + y) * nx + x;
             let section = (job.count(0, oz) * job.count(1, oy)) as u32;
             n[..len].iter_mut().zip(&*columns).for_each(|(n, c)| *n = section * c);
-            estimate::inverse_row(setup.level, &n[..len], inverse);
+            if divides {
+                estimate::inverse_row(setup.level, &n[..len], inverse);
+            }
             if job.needs.extremes {
                 for (i, e) in part.extremes[from..from + len].iter().enumerate() {
                     (lo[i], hi[i]) = (T::from_f64((e & 0xffff) as f64), T::from_f64((e >> 16) as f64));
@@ -135,7 +138,7 @@ fn rows<T: Code + Plain, X1: RowSum, X2: Acc>(
                 s2: if job.needs.variance { &s2[from..from + len] } else { &[] },
                 n: &n[..len],
                 inverse: &inverse[..len],
-                most: job.counts().0,
+                most: voxels,
                 width,
             };
             emit.int_row(setup, row, [oz, oy, first]);

@@ -330,7 +330,8 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let inverse = cut::<f64>(bytes, job.tile[1]);
     let coding = Coding { flip, missing: missing.unwrap_or_default() };
     let plain = Coding { flip: T::default(), missing: T::default() };
-    let width = Width::of(job.counts().0, T::TOP);
+    let (most, divides) = (job.counts().0, emit.divides());
+    let width = Width::of(most, T::TOP);
     for tile in Tile::all(job) {
         let (y, x) = (tile.y, tile.x);
         for (i, c) in columns[..tile.size[1]].iter_mut().enumerate() {
@@ -409,13 +410,17 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                     }
                     if M {
                         count.finish_row(level, job, j);
-                        estimate::inverse_row(level, &count.out[..tile.size[1]], inverse);
+                        if divides {
+                            estimate::inverse_row(level, &count.out[..tile.size[1]], inverse);
+                        }
                     } else {
                         let rows = job.count(1, y + j);
                         if rows != rows_counted {
                             let section = (section * rows) as u32;
                             n[..tile.size[1]].iter_mut().zip(&*columns).for_each(|(n, c)| *n = section * c);
-                            estimate::inverse_row(level, &n[..tile.size[1]], inverse);
+                            if divides {
+                                estimate::inverse_row(level, &n[..tile.size[1]], inverse);
+                            }
                             rows_counted = rows;
                         }
                     }
@@ -428,7 +433,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                         s2: s2.out,
                         n: if M { count.out } else { n },
                         inverse,
-                        most: job.counts().0,
+                        most,
                         width,
                     };
                     emit.int_row(setup, row, [z, y + j, x]);

@@ -44,7 +44,7 @@ pub fn power(a: f32, b: f32, range: f32, beta: f32) -> f32 {
 
 /// `t^beta` from `q = t`, or where `near` from `q = t - 1` in (-1/3, 0].
 #[inline(always)]
-pub fn power_of(q: f32, near: bool, beta: f32) -> f32 {
+fn power_of(q: f32, near: bool, beta: f32) -> f32 {
     const TWO_THIRDS: u32 = 0x3f2a_aaab;
     let bits = q.to_bits().wrapping_sub(TWO_THIRDS);
     let exponent = ((bits as i32) >> 23) as f32;

@@ -3,18 +3,17 @@
 use super::estimate::{Code, RowSum};
 use crate::kernel::singles::{F32x32, SINGLES};
 
-/// Runs `$body` for starts of blocks of 32 that cover `from..to`, at least 32 values; the last may overlap its neighbour, and
+/// Runs `$body` for starts of blocks of 32 that cover `0..len`, at least 32 values; the last may overlap its neighbour, and
 /// makes the same values again.
 macro_rules! blocks {
-    ($from:expr, $to:expr, |$at:ident| $body:block) => {
-        let (from, to) = ($from, $to);
-        let mut $at = from;
+    ($len:ident, |$at:ident| $body:block) => {
+        let mut $at = 0;
         loop {
             $body
-            if $at + SINGLES >= to {
+            if $at + SINGLES >= $len {
                 break;
             }
-            $at = ($at + SINGLES).min(to - SINGLES);
+            $at = ($at + SINGLES).min($len - SINGLES);
         }
     };
 }

@@ -11,23 +11,6 @@ use crate::kernel::window::estimate::{Code, Polarity, RowSum};
 /// cache: 0.76 ns per voxel in one pass, 0.72 in three (AVX2: 1.04 and 0.93).
 const STRIP: usize = 256;
 
-/// Runs `$body` for strips of at most [`STRIP`] values and at least 32 that cover `0..len`; the last may overlap.
-macro_rules! strips {
-    ($len:expr, |$from:ident, $to:ident| $body:block) => {
-        let len = $len;
-        assert!(len >= SINGLES);
-        let mut $from = 0;
-        loop {
-            let $to = len.min($from + STRIP);
-            $body
-            if $to == len {
-                break;
-            }
-            $from = $to.min(len - SINGLES);
-        }
-    };
-}
-
 crate::on_singles! {
     /// A 3.2: `t^beta`, from extremes and sums.
     fn power_at[T: Code, X1: RowSum, const FLIPPED: bool, const NARROW: bool](
@@ -71,17 +54,25 @@ fn power_inner<L: F32x32, T: Code, X1: RowSum, const FLIPPED: bool, const NARROW
     out: &mut [f32],
 ) {
     let (mut ratios, mut betas, mut exponents) = ([0f32; STRIP], [0f32; STRIP], [0f32; STRIP]);
-    strips!(out.len(), |from, to| {
+    assert!(out.len() >= SINGLES);
+    let mut from = 0;
+    loop {
+        let to = out.len().min(from + STRIP);
         let len = to - from;
         let (q, beta, x) = (&mut ratios[..len], &mut betas[..len], &mut exponents[..len]);
-        let (row, lo, hi, out) = (row.part(from, to), &lo[from..to], &hi[from..to], &mut out[from..to]);
+        let (row, lo, hi) = (row.part(from, to), &lo[from..to], &hi[from..to]);
         if ratios_of::<L, T, X1, FLIPPED, NARROW>(&row, lo, hi, constant, q, beta) {
-            out.fill(constant);
+            out[from..to].fill(constant);
         } else {
             logarithms::<L>(q, beta, x);
-            powers::<L>(x, out);
+            powers::<L>(x, &mut out[from..to]);
         }
-    });
+        if to == out.len() {
+            return;
+        }
+        // A last strip of less than a block starts earlier, and makes some values again.
+        from = to.min(out.len() - SINGLES);
+    }
 }
 
 /// What [`logarithms`] asks for: t, or where it is at least 2/3 t - 1 (never +0 there), and beta. Returns whether all windows
@@ -99,7 +90,7 @@ fn ratios_of<L: F32x32, T: Code, X1: RowSum, const FLIPPED: bool, const NARROW: 
     let (v, s1, n, lo, hi) = (&row.v[..len], &row.s1[..len], &row.n[..len], &lo[..len], &hi[..len]);
     assert!(len >= SINGLES && betas.len() == len);
     let mut all_flat = true;
-    blocks!(0, len, |at| {
+    blocks!(len, |at| {
         // SAFETY: `at + 32 <= len`, the length of every slice.
         unsafe {
             let c = T::codes::<L>(v.as_ptr().add(at), row.flip);
@@ -159,12 +150,12 @@ fn shape<L: F32x32>([a, b, range, p, q]: [L; 5], constant: f32) -> (L, L, bool) 
     (L::pick(flat, whole, ratio), L::pick(flat, L::splat(1.0), beta), L::all(flat))
 }
 
-/// `beta log2 t`, by [`super::super::math::power_of`]'s polynomial; far below 0 where t is 0.
+/// `beta log2 t`, by [`super::super::math::power`]'s polynomial; far below 0 where t is 0.
 #[inline(always)]
 fn logarithms<L: F32x32>(ratios: &[f32], betas: &[f32], exponents: &mut [f32]) {
     let len = exponents.len();
     assert!(len >= SINGLES && ratios.len() == len && betas.len() == len);
-    blocks!(0, len, |at| {
+    blocks!(len, |at| {
         // SAFETY: `at + 32 <= len`.
         unsafe {
             let q = L::load(ratios.as_ptr().add(at));
@@ -189,7 +180,7 @@ fn logarithms<L: F32x32>(ratios: &[f32], betas: &[f32], exponents: &mut [f32]) {
 fn powers<L: F32x32>(exponents: &[f32], out: &mut [f32]) {
     let len = out.len();
     assert!(len >= SINGLES && exponents.len() == len);
-    blocks!(0, len, |at| {
+    blocks!(len, |at| {
         // SAFETY: `at + 32 <= len`.
         unsafe { exp2(L::load(exponents.as_ptr().add(at))).store(out.as_mut_ptr().add(at)) };
     });

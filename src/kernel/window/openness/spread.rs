@@ -66,7 +66,7 @@ fn spread_inner<L: F32x32, T: Code, X1: RowSum, const KIND: usize, const NARROW:
     let zero = L::splat(0.0);
     // What is made below is S1 - n v.
     let sign = L::splat(if polarity.flipped { scale } else { -scale });
-    blocks!(0, len, |at| {
+    blocks!(len, |at| {
         // SAFETY: `at + 32 <= len`, the length of every slice.
         let d = unsafe {
             if NARROW {

@@ -1,0 +1,20 @@
+// One thread of each pass of a shader that has two kinds: the first from packed voxels, the next from what passes left.
+// `one` is the shader's own.
+
+@compute @workgroup_size(64)
+fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+         @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread < p.threads {
+        one(thread, true);
+    }
+}
+
+@compute @workgroup_size(64)
+fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread < p.threads {
+        one(thread, false);
+    }
+}
