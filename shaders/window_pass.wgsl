@@ -1,4 +1,4 @@
-// What the passes over windows share: their parameters, which part of which line a thread takes, and the entry points. A
+// What the passes over windows share: their parameters, and which part of which line a thread takes. A
 // shader adds `walk`, which makes the outputs of one block of one line.
 //
 // Parameters: src/gpu/passes.rs, struct Pass. Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no
