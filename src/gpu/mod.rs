@@ -12,6 +12,7 @@
 //! | `maps`, `occlusion` | occlusion maps recorded, and called |
 //! | `finish` | results of f32 windows made of moments there |
 //! | `chain`, `smoothed` | a Gaussian and what reads it, recorded together and called |
+//! | `nodes` | whether a machine can have a GPU at all |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
 //! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
@@ -27,6 +28,7 @@ mod float_windows;
 mod gaussian;
 mod gradient;
 pub mod maps;
+mod nodes;
 mod obscurance;
 mod occlusion;
 pub mod pairs;
@@ -55,6 +57,12 @@ pub fn find(device: Device, opened: &mut Option<Gpu>) -> Result<GpuFacts, String
         Device::GpuSoftware => GpuKind::Software,
         _ => GpuKind::Hardware,
     };
+    // Only where a GPU is not asked for: a device node that this list lacks must not keep anybody from theirs.
+    if device == Device::Auto
+        && let Some(missing) = nodes::none()
+    {
+        return Err(missing);
+    }
     let gpu = Gpu::open(kind)?;
     Ok(opened.insert(gpu).facts().clone())
 }

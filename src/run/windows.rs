@@ -9,8 +9,10 @@ use crate::store::source::ChunkRead;
 
 /// Share of voxels that may lie beyond each end.
 const TAIL: f64 = 0.01;
-/// Voxels looked at per component at most: larger levels (an explicit `levels = 1`) are sampled by whole chunks.
-const MOST: usize = 4 << 20;
+/// Voxels decoded per component at most, about: larger levels (an explicit `levels = 1`) are sampled by whole chunks.
+const DECODED: usize = 4 << 20;
+/// Values that a window is chosen from, about: each of its percentiles then lies within 0.05 percent of the voxels decoded.
+const CHOSEN: usize = 1 << 17;
 
 /// One window per component, in the units of the stored numbers. What cannot be read gets the type's range: a window is a
 /// convenience, never a reason to fail.
@@ -45,23 +47,25 @@ fn window(source: &Source, component: usize) -> Option<[f64; 2]> {
     let chunk = info.chunk?;
     let whole = Region::whole(info.shape);
     let cells: Vec<[i64; 3]> = whole.cells([0; 3], chunk).iter().collect();
-    let step = (info.voxels() / MOST + 1).min(cells.len().max(1));
+    let step = (info.voxels() / DECODED + 1).min(cells.len().max(1));
+    // Odd, so that it meets every column of rows whose length is a power of two.
+    let stride = (info.voxels().min(DECODED) / CHOSEN) | 1;
+    let mut voxels = Voxels::zeroed(info.dtype, chunk.iter().product());
     let mut values = Vec::new();
     for index in cells.into_iter().step_by(step) {
-        let mut voxels = Voxels::zeroed(info.dtype, chunk.iter().product());
         let part = Region::of_cell(index, [0; 3], chunk).clip(&whole);
         match source.read_chunk(component, index, &mut voxels).ok()? {
-            ChunkRead::Missing(v) => values.push(v),
+            ChunkRead::Missing(v) => values.extend(std::iter::repeat_n(v, part.voxels().div_ceil(stride))),
             ChunkRead::Data { .. } => {
-                let view = voxels.view(chunk);
-                let n = part.shape();
-                values.extend(Region::whole(n).iter().map(|i| view.at_f64(i.map(|v| v as usize))));
+                let (view, n) = (voxels.view(chunk), part.shape());
+                let places = (0..part.voxels()).step_by(stride).map(|i| [i / (n[1] * n[2]), i / n[2] % n[1], i % n[2]]);
+                values.extend(places.map(|at| view.at_f64(at)));
             }
         }
     }
     values.retain(|v| v.is_finite());
-    values.sort_by(f64::total_cmp);
-    let at = |share: f64| values.get((share * (values.len().saturating_sub(1)) as f64).round() as usize).copied();
-    let (lo, hi) = (at(TAIL)?, at(1.0 - TAIL)?);
+    let last = values.len().checked_sub(1)?;
+    let mut at = |share: f64| *values.select_nth_unstable_by((share * last as f64).round() as usize, f64::total_cmp).1;
+    let (lo, hi) = (at(TAIL), at(1.0 - TAIL));
     Some(if hi > lo { [lo, hi] } else { [lo, lo + 1.0] })
 }

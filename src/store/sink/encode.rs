@@ -82,6 +82,11 @@ impl Encoder {
         })
     }
 
+    /// Takes back bytes that were written, for the next chunk.
+    pub fn reuse(&self, bytes: Vec<u8>) {
+        self.buffers.lock().unwrap_or_else(|e| e.into_inner()).push(bytes);
+    }
+
     /// By bits, so that -0 is not lost; any NaN equals any other. The first voxel decides nearly always.
     fn holds_only_fill<T: Voxel>(&self, v: View<T>) -> bool {
         let [nz, ny, nx] = v.shape;

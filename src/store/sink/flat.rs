@@ -1,5 +1,6 @@
 //! One file with all voxels: written in place under another name, moved when it is whole.
 
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::Read;
@@ -81,7 +82,7 @@ impl Flat {
     }
 
     /// Writes a box, row by row or in longer runs where rows join. Returns the bytes written.
-    pub fn put(&self, spec: &SinkSpec, component: usize, region: Region, chunk: Encoded) -> Result<u64> {
+    pub fn put(&self, spec: &SinkSpec, component: usize, region: Region, chunk: &Encoded) -> Result<u64> {
         let [nz, ny, nx] = spec.pyramid.levels[0].shape;
         let (size, n) = (spec.dtype.size(), region.shape());
         // Runs of voxels that follow each other both in the file and in the box.
@@ -89,13 +90,13 @@ impl Flat {
         let planes = if rows == ny && n[1] == ny { n[0] } else { 1 };
         let run = planes * rows * n[2] * size;
         let bytes = match chunk {
-            Encoded::Bytes(bytes) => bytes,
+            Encoded::Bytes(bytes) => Cow::Borrowed(&bytes[..]),
             Encoded::Empty => {
                 let fill = fill_bytes(spec.dtype, spec.fill);
                 if fill.iter().all(|b| *b == 0) {
                     return Ok(0); // a hole reads as zeros
                 }
-                fill.repeat(region.voxels())
+                Cow::Owned(fill.repeat(region.voxels()))
             }
         };
         if bytes.len() != region.voxels() * size {

@@ -185,7 +185,13 @@ impl Sink {
         }
         match &self.files {
             Files::Zarr(zarr) => zarr.put(&self.spec, level, component, region, chunk),
-            Files::Flat(flat) => flat.put(&self.spec, component, region, chunk),
+            Files::Flat(flat) => {
+                let written = flat.put(&self.spec, component, region, &chunk);
+                if let Encoded::Bytes(bytes) = chunk {
+                    self.encoder.reuse(bytes);
+                }
+                written
+            }
         }
     }
 
