@@ -313,10 +313,11 @@ impl<'a> Engine<'a> {
     }
 
     fn pointwise(&self, step: &Step, inputs: &[&Value], outputs: &mut [Value], region: Region) {
-        let wire = |i: usize| &self.plan.graph.wires[step.inputs[i]];
-        let affine = |i: usize| (wire(i).affine, wire(i).missing);
         // A component of an input: the same one, or the only one.
-        let part = |i: usize, c: usize| inputs[i].view(c.min(inputs[i].comps.len() - 1), region);
+        let part = |i: usize, c: usize| -> pointwise::Operand {
+            let wire = &self.plan.graph.wires[step.inputs[i]];
+            (inputs[i].view(c.min(inputs[i].comps.len() - 1), region), wire.affine, wire.missing)
+        };
         match &step.kind {
             StepKind::Transfer { points, channels } => {
                 let (mut opacity, mut rgb) = (None, None);
@@ -327,8 +328,7 @@ impl<'a> Engine<'a> {
                         TransferChannel::Rgb => rgb = Some(three(views)),
                     }
                 }
-                let (a, missing) = affine(0);
-                pointwise::transfer(part(0, 0), a, missing, points, opacity, rgb);
+                pointwise::transfer(part(0, 0), points, opacity, rgb);
             }
             kind => {
                 for c in 0..outputs[0].comps.len() {
@@ -345,18 +345,14 @@ impl<'a> Engine<'a> {
                         }
                         StepKind::AmbientLight { k } => pointwise::ambient_light(part(0, c), part(1, c), *k, dst),
                         StepKind::Combine { kind } => {
-                            let parts: Vec<_> = (0..inputs.len())
-                                .map(|i| {
-                                    let (a, missing) = affine(i);
-                                    (part(i, c), a, missing)
-                                })
-                                .collect();
+                            let parts: Vec<_> = (0..inputs.len()).map(|i| part(i, c)).collect();
                             pointwise::combine(&parts, *kind, dst);
                         }
                         StepKind::Divide { by } => {
                             let max = Plan::global(&self.globals, *by)[1];
                             let slope = if max > 0.0 && max.is_finite() { 1.0 / max } else { 1.0 };
-                            pointwise::scale(part(0, c), Affine { slope, intercept: 0.0 }, None, dst);
+                            let (view, ..) = part(0, c);
+                            pointwise::scale(view, Affine { slope, intercept: 0.0 }, None, dst);
                         }
                         _ => unreachable!("window kernels do not come here"),
                     }
