@@ -13,12 +13,7 @@ pub type Operand<'a> = (AnyView<'a>, Affine, Option<i64>);
 /// Piecewise-linear table (B, A): scaled value to `opacity` and linear `rgb`, clamped at the ends. `points` ascend in their
 /// first entry; where two share it (a step) the later one holds at that value. NaN and `missing` give NaN. Panics if
 /// `points` is empty.
-pub fn transfer(
-    src: Operand,
-    points: &[TransferPoint],
-    opacity: Option<AnyViewMut>,
-    rgb: Option<[AnyViewMut; 3]>,
-) {
+pub fn transfer(src: Operand, points: &[TransferPoint], opacity: Option<AnyViewMut>, rgb: Option<[AnyViewMut; 3]>) {
     assert!(!points.is_empty(), "a transfer table needs a point");
     let shape = src.0.shape();
     let [r, g, b] = rgb.map_or([None, None, None], |c| c.map(Some));
