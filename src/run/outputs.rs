@@ -121,7 +121,12 @@ fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Res
 /// Opens every output of a group that is not complete.
 pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], resume: bool) -> Result<Target> {
     let output = &plan.outputs[o];
-    let sink = Sink::create(output.spec.clone(), resume)?;
+    let range = range_of(output, globals);
+    let mut spec = output.spec.clone();
+    if output.auto_range.is_some() {
+        spec.fill = output.missing(0, range);
+    }
+    let sink = Sink::create(spec, resume)?;
     let dir = Sink::work_dir(&output.spec.path);
     let parts = output.spec.components.unwrap_or(1);
     let mut levels = Vec::new();
@@ -137,7 +142,7 @@ pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], r
         let shape = output.level(deepest).expect("level exists").shape;
         Spill::open(&dir.join(format!("cells.{deepest}")), shape, per_cell, size_of::<f64>())
     });
-    Ok(Target { sink, levels, cells: cells.transpose()?, range: range_of(output, globals) })
+    Ok(Target { sink, levels, cells: cells.transpose()?, range })
 }
 
 /// The values that map to 0 and the largest code, from the config or a pre-pass.
@@ -213,7 +218,7 @@ pub fn attributes(
         "stages": methods,
         "dtype": output.spec.dtype.numpy_name(),
         "value_range": range.filter(|_| integer),
-        "fill": json_number(output.spec.fill),
+        "fill": json_number(if output.auto_range.is_some() { output.missing(0, range) } else { output.spec.fill }),
         "polarity": output.openness.then_some("openness: 1 is open, 0 is occluded"),
         "channel": channel_names(config, output),
         "units": lattice.unit,

@@ -263,6 +263,12 @@ def stored(folder, stage, close):
     close("window of a scaled input", stage(folder, source, body), np.where(s < 0.2001, 0, np.where(s > 0.7001, 1, s)), 1e-6)
     body = "op = 'opacity_modulation'\nby = 'a'\nsigma_max2 = 0.5"
     close("modulation of a scaled input", stage(folder, source, body), s * np.minimum(s / 0.5, 1), 1e-6)
+    # Missing voxels hold `fill` in integers too, whatever their range turns out to be.
+    v = v.astype("<i2") - 100
+    np.save(folder / "a.npy", v)
+    got = stage(folder, "path = 'a.npy'\nnodata = -91", "op = 'box'\nradius = 0\nfill = 30", dtype="u16", range="auto")
+    low, high = v[v != -91].min(), v[v != -91].max()
+    close("missing voxels by a range found", got, np.rint((np.where(v == -91, 30, v) - low) / (high - low) * 65535), 0)
 
 
 def beyond(folder, stage, close):

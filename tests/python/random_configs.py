@@ -76,15 +76,16 @@ def box(f, stage, _):
     scale = lambda a: f.slope * a.astype(EXTENDED) + f.intercept
     once = np.finfo(f.result).eps * 0.51
     loose = (1e-5 if f.result == "f4" else 1e-9) if f.dtype.kind == "f" else 4 * once
-    size = np.abs(f.slope * mean) + abs(f.intercept)
+    # Where results are f64, so is what they are made of: a few steps, of the largest value.
+    size = np.abs(f.slope * np.where(m, v, 0)).max(-1) + abs(f.intercept)
     moment2 = variance + scale(mean) ** 2
     return {
-        "mean": (scale(mean), once * np.abs(scale(mean)) + 4e-16 * size),
+        "mean": (scale(mean), once * np.abs(scale(mean)) + 1e-15 * size),
         "min": (scale(low), 0 if f.plain else 1e-7 * np.abs(scale(low))),
         "max": (scale(high), 0 if f.plain else 1e-7 * np.abs(scale(high))),
         "variance": (variance, loose * variance),
         "std": (np.sqrt(variance), loose * np.sqrt(variance)),
-        "moment2": (moment2, 2 * once * moment2 + 4e-16 * size**2),
+        "moment2": (moment2, 2 * once * moment2 + 2e-15 * size**2),
     }
 
 
