@@ -333,7 +333,8 @@ class Case:
             whole = got.dtype.kind in "iu"
             if whole:  # a missing voxel stays missing for later stages; what stands in its place says nothing
                 fill = float(np.clip(np.rint(fill), np.iinfo(got.dtype).min, np.iinfo(got.dtype).max))
-                self.fields[f"{name}.{channel}"].valid = ok | ~need
+                # A fill that is the stored value of missing voxels reads as missing.
+                self.fields[f"{name}.{channel}"].valid = np.where(need, ok, fill != self.input.get("nodata"))
             want = np.where(need, np.where(ok, want, np.nan), fill)
             # The regression of a window that does not span space has no one answer.
             self.judge(f"{name} {stage['op']} {channel}", got, want, np.where(need, tolerance, 1e-6), ~(whole & ~ok & need) & self.spanned(stage, sources[0]))
