@@ -86,6 +86,28 @@ fn wrong_usage_is_2_and_leaves_stdout_empty() {
 }
 
 #[test]
+fn no_result_is_written_over_what_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let f = folder.path();
+    npy(&f.join("a.npy"), [3, 4, 5], |i| i as f32);
+    std::os::unix::fs::symlink("a.npy", f.join("link.npy")).unwrap();
+    let config = "[input.a]\npath = \"a.npy\"\n[output.o]\npath = \"o.npy\"\nfrom = \"a\"\n";
+    std::fs::write(f.join("c.toml"), config).unwrap();
+    let before = std::fs::read(f.join("a.npy")).unwrap();
+    for args in [
+        vec!["preview", "a.npy", "a.npy"],
+        vec!["preview", "a.npy", "link.npy"],
+        vec!["run", "c.toml", "--report", "a.npy"],
+        vec!["run", "c.toml", "--trace", "link.npy"],
+        vec!["run", "c.toml", "--report", "c.toml"],
+    ] {
+        let (code, _, err) = call(f, &args);
+        assert!(code == 2 && err.contains("which is read"), "{args:?}: {err}");
+    }
+    assert!(std::fs::read(f.join("a.npy")).unwrap() == before && !f.join("o.npy").exists());
+}
+
+#[test]
 fn a_closed_pipe_is_no_failure_to_talk_about() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_occlude"))
         .arg("schema")

@@ -171,13 +171,23 @@ fn a_changed_config_or_input_is_not_resumed() {
     assert!(error.to_string().contains("configuration"), "{error}");
     let error = occlude::run::run(&config, &RunOptions::default(), &occlude::run::Silent).unwrap_err();
     assert!(error.to_string().contains("--resume"), "{error}");
-    let mut bytes = fs::read(dir.path().join("vol.npy")).unwrap();
-    let middle = bytes.len() - 1;
-    bytes[middle] ^= 1;
-    bytes[200] ^= 1;
-    fs::write(dir.path().join("vol.npy"), bytes).unwrap();
+    let change = || {
+        let mut bytes = fs::read(dir.path().join("vol.npy")).unwrap();
+        let middle = bytes.len() - 1;
+        bytes[middle] ^= 1;
+        bytes[200] ^= 1;
+        fs::write(dir.path().join("vol.npy"), bytes).unwrap();
+    };
+    change();
     let error = occlude::run::run(&config, &resume, &occlude::run::Silent).unwrap_err();
     assert!(error.to_string().contains("input"), "{error}");
+    // Nor is a finished output of another input taken for this one's.
+    let afresh = RunOptions { overwrite: true, ..Default::default() };
+    occlude::run::run(&config, &afresh, &occlude::run::Silent).unwrap();
+    occlude::run::run(&config, &resume, &occlude::run::Silent).unwrap();
+    change();
+    let error = occlude::run::run(&config, &resume, &occlude::run::Silent).unwrap_err();
+    assert!(error.exit_code() == 2 && error.to_string().contains("input"), "{error}");
 }
 
 #[test]

@@ -270,6 +270,16 @@ fn flat_files_hold_the_voxels_behind_their_header() {
 }
 
 #[test]
+fn flat_files_of_thin_volumes_hold_every_voxel_in_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    for shape in [[19, 1, 21], [1, 19, 21], [19, 21, 1], [1, 1, 21], [19, 1, 1]] {
+        let path = folder.path().join(format!("{shape:?}.raw"));
+        let spec = write_all(spec(path, OutputFormat::Raw, DType::U16, shape));
+        assert!(fs::read(&spec.path).unwrap() == expected(&spec, 0), "{shape:?}");
+    }
+}
+
+#[test]
 fn nrrd_and_nifti_keep_orientation_with_region_start() {
     let folder = tempfile::tempdir().unwrap();
     let matrix = [[-0.25, 0.0, 0.0, 10.0], [0.0, -0.25, 0.0, 20.0], [0.0, 0.0, 0.5, -5.0]];

@@ -3,7 +3,7 @@
 use super::args::{MapArg, PreviewArgs};
 use super::draw::{Canvas, ColourMap, GLYPH, GREY, MAGMA, VIRIDIS};
 use super::reader::{self, Volume};
-use super::{human, messages, usage, write_whole};
+use super::{human, messages, refuse_overwriting, usage, write_whole};
 use crate::Result;
 use crate::grid::Region;
 
@@ -28,6 +28,8 @@ struct Slice {
 pub fn run(args: &PreviewArgs) -> Result<()> {
     let cancel = messages::interrupts();
     let volume = Volume::open(&args.path, args.level, &args.raw, &cancel)?;
+    let files = volume.source.paths();
+    refuse_overwriting("OUT", &args.out, files.iter().chain([&args.path]).map(|p| p.as_path()))?;
     let shape = volume.info().shape;
     let wanted = match args.slice {
         None => [0, 1, 2].map(|axis| (axis, shape[axis] / 2)).to_vec(),

@@ -2,7 +2,8 @@
 
 use super::args::RunArgs;
 use super::progress::Shown;
-use super::{human, load, messages, usage, write_whole};
+use super::{human, load, messages, refuse_overwriting, usage, write_whole};
+use crate::config::InputKind;
 use crate::run::{self, Report, RunOptions};
 use crate::{Error, Result};
 
@@ -10,12 +11,17 @@ use crate::{Error, Result};
 pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
     let config = load(&args.config, &[])?;
     for (flag, path) in [("--report", &args.report), ("--trace", &args.trace)] {
+        let Some(path) = path else { continue };
         // Found out now rather than after hours.
-        let folder = path.as_ref().and_then(|p| p.parent()).filter(|p| !p.as_os_str().is_empty());
-        if folder.is_some_and(|f| !f.is_dir()) || path.as_ref().is_some_and(|p| p.is_dir()) {
-            let path = path.as_ref().map(|p| p.display().to_string()).unwrap_or_default();
-            return Err(usage(flag, format!("got {path}; expected a file in an existing folder")));
+        let folder = path.parent().filter(|p| !p.as_os_str().is_empty());
+        if folder.is_some_and(|f| !f.is_dir()) || path.is_dir() {
+            return Err(usage(flag, format!("got {}; expected a file in an existing folder", path.display())));
         }
+        let inputs = config.inputs.iter().filter_map(|i| match &i.kind {
+            InputKind::Path { path, .. } => Some(path.as_path()),
+            InputKind::Synthetic { .. } => None,
+        });
+        refuse_overwriting(flag, path, inputs.chain([config.file.as_path()]))?;
     }
     let options = RunOptions {
         resume: args.resume,

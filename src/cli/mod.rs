@@ -17,6 +17,7 @@ pub mod plot;
 pub mod progress;
 pub mod reader;
 
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
@@ -101,8 +102,17 @@ fn usage(flag: &str, message: impl std::fmt::Display) -> Error {
     Error::config(flag, message)
 }
 
+/// Refuses to write a result over a file that is read.
+fn refuse_overwriting<'a>(flag: &str, out: &Path, read: impl IntoIterator<Item = &'a Path>) -> Result<()> {
+    let same = |p: &Path| out == p || matches!((out.canonicalize(), p.canonicalize()), (Ok(a), Ok(b)) if a == b);
+    match read.into_iter().find(|p| same(p)) {
+        Some(_) => Err(usage(flag, format!("got {}, which is read; expected another file", out.display()))),
+        None => Ok(()),
+    }
+}
+
 /// Writes a file under a temporary name first, so that no reader sees half of it.
-fn write_whole(path: &std::path::Path, bytes: &[u8]) -> Result<()> {
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     let mut name = path.file_name().ok_or_else(|| Error::file(path, "is not a file name"))?.to_os_string();
     name.push(format!(".{}.tmp", std::process::id()));
     let temporary = path.with_file_name(name);

@@ -7,26 +7,21 @@ use super::values::{BLOCK, blocks, load_any, store_any};
 use crate::grid::{Affine, AnyView, AnyViewMut};
 use crate::stage::{CombineKind, TransferPoint, WindowMode};
 
+/// What a stage reads: stored voxels, what scales them, and the stored value of missing ones.
+pub type Operand<'a> = (AnyView<'a>, Affine, Option<i64>);
+
 /// Piecewise-linear table (B, A): scaled value to `opacity` and linear `rgb`, clamped at the ends. `points` ascend in their
 /// first entry; where two share it (a step) the later one holds at that value. NaN and `missing` give NaN. Panics if
 /// `points` is empty.
-pub fn transfer(
-    src: AnyView,
-    affine: Affine,
-    missing: Option<i64>,
-    points: &[TransferPoint],
-    opacity: Option<AnyViewMut>,
-    rgb: Option<[AnyViewMut; 3]>,
-) {
+pub fn transfer(src: Operand, points: &[TransferPoint], opacity: Option<AnyViewMut>, rgb: Option<[AnyViewMut; 3]>) {
     assert!(!points.is_empty(), "a transfer table needs a point");
-    let shape = src.shape();
+    let shape = src.0.shape();
     let [r, g, b] = rgb.map_or([None, None, None], |c| c.map(Some));
     let mut outs = [opacity, r, g, b];
     outs.iter().flatten().for_each(|o| assert_eq!(o.shape(), shape, "extents differ"));
     let (mut values, mut results) = ([0.0; BLOCK], [0.0; BLOCK]);
     for (at, n) in blocks(shape) {
-        load_any(&src, at, missing, &mut values[..n]);
-        values[..n].iter_mut().for_each(|v| *v = affine.apply(*v));
+        load_scaled(&src, at, &mut values[..n]);
         for (component, out) in outs.iter_mut().enumerate() {
             let Some(out) = out else { continue };
             for (result, v) in results[..n].iter_mut().zip(&values) {
@@ -54,7 +49,7 @@ fn table(points: &[TransferPoint], component: usize, v: f64) -> f64 {
 
 /// B 5.1: below `low` 0, above `high` 1, between kept or stretched to [0, 1]. Stretching an empty interval gives 1 at it.
 /// NaN stays.
-pub fn openness_window(src: AnyView, low: f64, high: f64, mode: WindowMode, dst: AnyViewMut) {
+pub fn openness_window(src: Operand, low: f64, high: f64, mode: WindowMode, dst: AnyViewMut) {
     map(src, dst, |v| match mode {
         _ if v < low => 0.0,
         _ if v > high => 1.0,
@@ -66,7 +61,7 @@ pub fn openness_window(src: AnyView, low: f64, high: f64, mode: WindowMode, dst:
 }
 
 /// A 4.2: `opacity * min(by / sigma_max2, 1)`. A variance of 0 gives 0 whatever the bound; NaN in either gives NaN.
-pub fn modulate_by_variance(opacity: AnyView, by: AnyView, sigma_max2: f64, dst: AnyViewMut) {
+pub fn modulate_by_variance(opacity: Operand, by: Operand, sigma_max2: f64, dst: AnyViewMut) {
     map2(opacity, by, dst, |o, variance| {
         let share = if variance.is_nan() {
             variance
@@ -82,7 +77,7 @@ pub fn modulate_by_variance(opacity: AnyView, by: AnyView, sigma_max2: f64, dst:
 }
 
 /// B 5.2: `clamp(opacity * s * gain, 0, 1)`, 0 where the saliency s is below `threshold`. NaN in either gives NaN.
-pub fn modulate_by_saliency(opacity: AnyView, by: AnyView, threshold: f64, gain: f64, dst: AnyViewMut) {
+pub fn modulate_by_saliency(opacity: Operand, by: Operand, threshold: f64, gain: f64, dst: AnyViewMut) {
     map2(opacity, by, dst, |o, s| {
         if o.is_nan() || s.is_nan() {
             f64::NAN
@@ -95,21 +90,20 @@ pub fn modulate_by_saliency(opacity: AnyView, by: AnyView, threshold: f64, gain:
 }
 
 /// A eq. 5, one component: `k * openness * colour`.
-pub fn ambient_light(openness: AnyView, colour: AnyView, k: f64, dst: AnyViewMut) {
+pub fn ambient_light(openness: Operand, colour: Operand, k: f64, dst: AnyViewMut) {
     map2(openness, colour, dst, |o, c| k * o * c);
 }
 
 /// Joins inputs of one shape, voxel by voxel, in the order given; arithmetic in f64, scaled by each input's affine. A voxel
 /// that is NaN or `missing` in one input is NaN. Panics without inputs.
-pub fn combine(inputs: &[(AnyView, Affine, Option<i64>)], kind: CombineKind, mut dst: AnyViewMut) {
+pub fn combine(inputs: &[Operand], kind: CombineKind, mut dst: AnyViewMut) {
     let shape = dst.shape();
     assert!(!inputs.is_empty(), "nothing to combine");
     inputs.iter().for_each(|(v, ..)| assert_eq!(v.shape(), shape, "extents differ"));
     let (mut joined, mut next) = ([0.0; BLOCK], [0.0; BLOCK]);
     for (at, n) in blocks(shape) {
-        for (i, (view, affine, missing)) in inputs.iter().enumerate() {
-            load_any(view, at, *missing, &mut next[..n]);
-            next[..n].iter_mut().for_each(|v| *v = affine.apply(*v));
+        for (i, input) in inputs.iter().enumerate() {
+            load_scaled(input, at, &mut next[..n]);
             if i == 0 {
                 joined = next;
             } else {
@@ -146,36 +140,36 @@ fn join(kind: CombineKind, a: f64, b: f64) -> f64 {
 }
 
 /// Scaled values: `slope * stored + intercept`; NaN and `missing` give NaN.
-pub fn scale(src: AnyView, affine: Affine, missing: Option<i64>, mut dst: AnyViewMut) {
-    assert_eq!(src.shape(), dst.shape(), "extents differ");
-    let mut values = [0.0; BLOCK];
-    for (at, n) in blocks(src.shape()) {
-        load_any(&src, at, missing, &mut values[..n]);
-        if !affine.is_identity() {
-            values[..n].iter_mut().for_each(|v| *v = affine.apply(*v));
-        }
-        store_any(&mut dst, at, &values[..n]);
+pub fn scale(src: AnyView, affine: Affine, missing: Option<i64>, dst: AnyViewMut) {
+    map((src, affine, missing), dst, |v| v);
+}
+
+#[inline(always)]
+fn load_scaled((view, affine, missing): &Operand, at: [usize; 3], values: &mut [f64]) {
+    load_any(view, at, *missing, values);
+    if !affine.is_identity() {
+        values.iter_mut().for_each(|v| *v = affine.apply(*v));
     }
 }
 
 #[inline(always)]
-fn map(src: AnyView, mut dst: AnyViewMut, f: impl Fn(f64) -> f64) {
-    assert_eq!(src.shape(), dst.shape(), "extents differ");
+fn map(src: Operand, mut dst: AnyViewMut, f: impl Fn(f64) -> f64) {
+    assert_eq!(src.0.shape(), dst.shape(), "extents differ");
     let mut values = [0.0; BLOCK];
-    for (at, n) in blocks(src.shape()) {
-        load_any(&src, at, None, &mut values[..n]);
+    for (at, n) in blocks(dst.shape()) {
+        load_scaled(&src, at, &mut values[..n]);
         values[..n].iter_mut().for_each(|v| *v = f(*v));
         store_any(&mut dst, at, &values[..n]);
     }
 }
 
 #[inline(always)]
-fn map2(a: AnyView, b: AnyView, mut dst: AnyViewMut, f: impl Fn(f64, f64) -> f64) {
-    assert!(a.shape() == dst.shape() && b.shape() == dst.shape(), "extents differ");
+fn map2(a: Operand, b: Operand, mut dst: AnyViewMut, f: impl Fn(f64, f64) -> f64) {
+    assert!(a.0.shape() == dst.shape() && b.0.shape() == dst.shape(), "extents differ");
     let (mut left, mut right) = ([0.0; BLOCK], [0.0; BLOCK]);
-    for (at, n) in blocks(a.shape()) {
-        load_any(&a, at, None, &mut left[..n]);
-        load_any(&b, at, None, &mut right[..n]);
+    for (at, n) in blocks(dst.shape()) {
+        load_scaled(&a, at, &mut left[..n]);
+        load_scaled(&b, at, &mut right[..n]);
         left[..n].iter_mut().zip(&right).for_each(|(l, r)| *l = f(*l, *r));
         store_any(&mut dst, at, &left[..n]);
     }
@@ -192,6 +186,11 @@ mod tests {
 
     fn view(v: &Voxels) -> AnyView<'_> {
         v.view([1, 1, v.len()])
+    }
+
+    /// Values as they are stored.
+    fn plain(v: &Voxels) -> Operand<'_> {
+        (view(v), Affine::IDENTITY, None)
     }
 
     /// Runs `f` on a destination of `n` voxels.
@@ -217,7 +216,7 @@ mod tests {
         let (mut green, mut blue) = (red.clone(), red.clone());
         let opacity = run(DType::F32, 8, |d| {
             let rgb = [&mut red, &mut green, &mut blue].map(|c| c.view_mut([1, 1, 8]));
-            transfer(view(&v), Affine::IDENTITY, Some(77), &points, Some(d), Some(rgb));
+            transfer((view(&v), Affine::IDENTITY, Some(77)), &points, Some(d), Some(rgb));
         });
         same(&opacity, &[0.0, 0.0, 0.1f32 as f64, 0.5, 0.9f32 as f64, 0.5, 0.5, f64::NAN]);
         let component = |c: &Voxels| (0..7).map(|i| c.at(i)).collect::<Vec<_>>();
@@ -231,14 +230,14 @@ mod tests {
         let points = [[1.0, 0.25, 0.0, 0.0, 0.0], [3.0, 0.75, 0.0, 0.0, 0.0]];
         let v = Voxels::F32(vec![f32::NEG_INFINITY, f32::INFINITY, NAN, 1.0]);
         let affine = Affine::new(-2.0, 4.0);
-        let got = run(DType::F64, 4, |d| transfer(view(&v), affine, None, &points, Some(d), None));
+        let got = run(DType::F64, 4, |d| transfer((view(&v), affine, None), &points, Some(d), None));
         same(&got, &[0.75, 0.25, f64::NAN, 0.5]);
     }
 
     #[test]
     fn windows_keep_and_stretch() {
         let v = Voxels::F32(vec![0.1, 0.25, 0.5, 0.75, 0.9, NAN]);
-        let got = |low, high, mode| run(DType::F32, 6, |d| openness_window(view(&v), low, high, mode, d));
+        let got = |low, high, mode| run(DType::F32, 6, |d| openness_window(plain(&v), low, high, mode, d));
         same(&got(0.25, 0.75, WindowMode::Keep), &[0.0, 0.25, 0.5, 0.75, 1.0, f64::NAN]);
         same(&got(0.25, 0.75, WindowMode::Stretch), &[0.0, 0.0, 0.5, 1.0, 1.0, f64::NAN]);
         same(&got(0.5, 0.5, WindowMode::Stretch), &[0.0, 0.0, 1.0, 1.0, 1.0, f64::NAN]);
@@ -248,20 +247,39 @@ mod tests {
     fn modulation_is_bounded_and_spreads_nan() {
         let opacity = Voxels::F32(vec![0.5, 0.5, 0.5, 0.5, NAN]);
         let by = Voxels::F32(vec![0.0, 2.0, 9.0, NAN, 1.0]);
-        let variance = |s2| run(DType::F32, 5, |d| modulate_by_variance(view(&opacity), view(&by), s2, d));
+        let variance = |s2| run(DType::F32, 5, |d| modulate_by_variance(plain(&opacity), plain(&by), s2, d));
         same(&variance(4.0), &[0.0, 0.25, 0.5, f64::NAN, f64::NAN]);
         same(&variance(0.0), &[0.0, 0.5, 0.5, f64::NAN, f64::NAN]);
-        let saliency = run(DType::F32, 5, |d| modulate_by_saliency(view(&opacity), view(&by), 1.0, 0.5, d));
+        let saliency = run(DType::F32, 5, |d| modulate_by_saliency(plain(&opacity), plain(&by), 1.0, 0.5, d));
         same(&saliency, &[0.0, 0.5, 1.0, f64::NAN, f64::NAN]);
-        let light = run(DType::F32, 5, |d| ambient_light(view(&opacity), view(&by), 2.0, d));
+        let light = run(DType::F32, 5, |d| ambient_light(plain(&opacity), plain(&by), 2.0, d));
         same(&light, &[0.0, 2.0, 9.0, f64::NAN, f64::NAN]);
+    }
+
+    #[test]
+    fn stored_inputs_are_scaled_and_their_missing_voxels_stay_missing() {
+        let v = Voxels::U8(vec![0, 51, 204, 255, 77]);
+        let stored = || (view(&v), Affine::new(-1.0 / 255.0, 1.0), Some(77));
+        let got = run(DType::F64, 5, |d| openness_window(stored(), 0.1, 0.9, WindowMode::Keep, d));
+        same(&got, &[1.0, 1.0 - 51.0 / 255.0, 1.0 - 204.0 / 255.0, 0.0, f64::NAN]);
+        let two = Voxels::F64(vec![2.0; 5]);
+        let half = [1.0, 0.8, 0.2, 0.0, f64::NAN];
+        let close = |got: Vec<f64>, factor: f64| {
+            for (a, b) in got.iter().zip(half) {
+                assert!((a - factor * b).abs() < 1e-15 || a.is_nan() && b.is_nan(), "{got:?}");
+            }
+        };
+        close(run(DType::F64, 5, |d| modulate_by_variance(plain(&two), stored(), 1.0, d)), 2.0);
+        close(run(DType::F64, 5, |d| modulate_by_variance(stored(), plain(&two), 1.0, d)), 1.0);
+        close(run(DType::F64, 5, |d| modulate_by_saliency(stored(), plain(&two), 0.0, 0.5, d)), 1.0);
+        close(run(DType::F64, 5, |d| ambient_light(stored(), plain(&two), 0.5, d)), 1.0);
     }
 
     #[test]
     fn combine_scales_each_input_and_any_missing_voxel_wins() {
         let a = Voxels::U8(vec![1, 2, 3, 255]);
         let b = Voxels::F64(vec![10.0, -20.0, f64::NAN, 0.0]);
-        let inputs = [(view(&a), Affine::new(2.0, 1.0), Some(255)), (view(&b), Affine::IDENTITY, None)];
+        let inputs = [(view(&a), Affine::new(2.0, 1.0), Some(255)), plain(&b)];
         let got = |kind| run(DType::F64, 4, |d| combine(&inputs, kind, d));
         let nan = f64::NAN;
         same(&got(CombineKind::Add), &[13.0, -15.0, nan, nan]);

@@ -317,7 +317,7 @@ impl Cells {
         let variance = || self.inner[i] / n + self.between[i] / n;
         match self.kind {
             Reduce::Mean => self.value[i] / n,
-            Reduce::Moments if self.std => variance().sqrt(),
+            Reduce::Moments if self.std => rows::signed_root(variance()),
             Reduce::Moments => variance(),
             Reduce::Min | Reduce::Max | Reduce::Stride => self.value[i],
         }
@@ -407,7 +407,7 @@ fn load_voxels(level: Level, children: &mut Children, kind: Reduce, std: bool, s
             with_view!(AnyView, mean, v => rows::widen(level, v.row_at(z, y), value));
             between.fill(0.0);
             if std {
-                inner.iter_mut().for_each(|v| *v *= *v);
+                inner.iter_mut().for_each(|v| *v = rows::signed_square(*v));
             }
         } else {
             with_view!(AnyView, src.value, v => rows::widen(level, v.row_at(z, y), value));

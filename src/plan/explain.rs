@@ -11,6 +11,8 @@ use super::tasks::input_halo;
 use super::{Group, Plan};
 use crate::Result;
 use crate::config::Config;
+use crate::grid::Region;
+use crate::kernel::reduce::planes;
 use crate::store::{Source, open_inputs};
 
 /// Opens the inputs' headers, plans, and describes the plan for people and for programs. Runs nothing.
@@ -70,6 +72,14 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
             );
         }
     }
+    let (read, write) = traffic(plan, sources);
+    let _ = writeln!(
+        w,
+        "reads {} of voxels, each counted once, and writes {}, both before compression; scratch {}",
+        mib(read),
+        mib(write),
+        mib(scratch(plan, sources))
+    );
     for warning in &plan.warnings {
         let _ = writeln!(w, "warning: {warning}");
     }
@@ -161,27 +171,43 @@ fn makes(plan: &Plan, step: &Step) -> String {
     step.outputs.iter().map(|&w| plan.graph.wires[w].name.as_str()).collect::<Vec<_>>().join(", ")
 }
 
-/// Bytes of the inputs' voxels that the run reads at least once, and of level 0 and all levels written, uncompressed.
+/// Bytes of the inputs' voxels that bricks inside the region ask for, each once, and of all levels written, uncompressed.
 fn traffic(plan: &Plan, sources: &[Source]) -> (u64, u64) {
-    let mut inputs: Vec<usize> = Vec::new();
+    let mut asked = vec![0; sources.len()];
     for group in &plan.groups {
         for &w in &group.inputs {
-            if let Producer::Input(i) = plan.graph.wires[w].producer
-                && !inputs.contains(&i)
-            {
-                inputs.push(i);
-            }
+            let Producer::Input(i) = plan.graph.wires[w].producer else { continue };
+            let halo = input_halo(plan, group, w);
+            let seen = group.region.grow(halo).clip(&Region::whole(group.shape)).voxels();
+            let info = sources[i].info();
+            asked[i] = asked[i].max((seen * info.components * info.dtype.size()) as u64);
         }
     }
-    let size = |i: &usize| {
-        let info = sources[*i].info();
-        (info.voxels() * info.components * info.dtype.size()) as u64
-    };
     let written = |spec: &crate::store::SinkSpec| {
         let voxels: usize = spec.pyramid.levels.iter().map(|l| l.shape.iter().product::<usize>()).sum();
         (voxels * spec.components.unwrap_or(1) * spec.dtype.size()) as u64
     };
-    (inputs.iter().map(size).sum(), plan.outputs.iter().map(|o| written(&o.spec)).sum())
+    (asked.iter().sum(), plan.outputs.iter().map(|o| written(&o.spec)).sum())
+}
+
+/// Bytes on disk of what tasks leave for the second phase: levels whose chunks several tasks share, and cells for the
+/// levels beyond.
+fn second_phase(plan: &Plan) -> u64 {
+    let one = |group: &Group, o: usize| {
+        let output = &plan.outputs[o];
+        let (parts, deepest) = (output.spec.components.unwrap_or(1), output.brick_level());
+        let voxels = |k: usize| output.level(k).map_or(0, |l| l.shape.iter().product::<usize>());
+        let shared = (output.first_level()..=deepest).filter(|&k| output.is_zarr() && !output.owned(k, group));
+        let levels: usize = shared.map(|k| voxels(k) * parts * output.spec.dtype.size()).sum();
+        let per_cell = if output.map.is_some() { 2 } else { parts * planes(output.reduce) };
+        let beyond = if output.level_count() - 1 > deepest { deepest..output.level_count() } else { 0..0 };
+        (levels + beyond.map(|k| voxels(k) * per_cell * size_of::<f64>()).sum::<usize>()) as u64
+    };
+    plan.groups.iter().flat_map(|g| g.outputs.iter().map(move |&o| one(g, o))).sum()
+}
+
+fn scratch(plan: &Plan, sources: &[Source]) -> u64 {
+    sources.iter().map(Source::spool_bytes).sum::<u64>() + second_phase(plan)
 }
 
 fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>]) -> Value {
@@ -249,7 +275,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         "placement": plan.placement.iter().map(|(n, d, _)| (n.clone(), json!(d))).collect::<serde_json::Map<_, _>>(),
         "peak_memory_bytes": plan.groups.iter().map(|g| g.brick.peak(plan.workers)).max(),
         "memory_budget_bytes": plan.memory,
-        "scratch_bytes": sources.iter().map(Source::spool_bytes).sum::<u64>(),
+        "scratch_bytes": scratch(plan, sources),
         "read_amplification": plan.groups.iter().map(|g| g.brick.amplification).fold(0.0, f64::max),
         "bytes_to_read": read,
         "bytes_to_write": write,

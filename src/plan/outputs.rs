@@ -19,6 +19,8 @@ pub struct OutputPlan {
     pub parts: Vec<(WireId, usize)>,
     /// For `Reduce::Moments`: the mean beside each part.
     pub means: Vec<Option<WireId>>,
+    /// What stands for missing voxels of each part in integer outputs, in the channel's units; empty for maps.
+    pub fills: Vec<f64>,
     pub reduce: Reduce,
     /// Whether a `std` (not a variance) is pooled.
     pub is_std: bool,
@@ -113,6 +115,7 @@ fn plan_output(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered, ind
     let names = component_names(output, &used, &parts);
     let multi = parts.len() > 1 || output.from.len() > 1;
     let means = parts.iter().map(|&(w, _)| mean_beside(lowered, w)).collect();
+    let fills = used.iter().map(|w| w.fill).collect();
     let spec = SinkSpec {
         name: output.name.clone(),
         path: output.path.clone(),
@@ -135,6 +138,7 @@ fn plan_output(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered, ind
         spec,
         parts,
         means,
+        fills,
         reduce,
         is_std: used[0].channel == "std",
         range,
@@ -217,6 +221,7 @@ fn map_output(config: &Config, infos: &[VolumeInfo], lowered: &Lowered, index: u
         spec,
         parts: vec![],
         means: vec![],
+        fills: vec![],
         reduce: Reduce::Mean,
         is_std: false,
         range,
@@ -334,11 +339,26 @@ fn fill_value(
     let map_op = stage.is_some_and(|s| matches!(s.op, Op::OcclusionMap { .. }));
     debug_assert!(!map_op);
     match range {
-        Some([lo, hi]) => {
-            let max = dtype.range().1;
-            ((wire.fill - lo) / (hi - lo) * max).round_ties_even().clamp(0.0, max)
+        None if dtype != native => 0.0, // not known yet: see `OutputPlan::missing`
+        _ => code(dtype, wire.fill, range),
+    }
+}
+
+/// A value as an integer type stores it.
+fn code(dtype: DType, value: f64, range: Option<[f64; 2]>) -> f64 {
+    let (least, most) = dtype.range();
+    match range {
+        Some([lo, hi]) => ((value - lo) / (hi - lo) * most).round_ties_even().clamp(0.0, most),
+        None => value.round_ties_even().clamp(least, most),
+    }
+}
+
+impl OutputPlan {
+    /// What missing voxels of a component hold, once the range is known.
+    pub fn missing(&self, component: usize, range: Option<[f64; 2]>) -> f64 {
+        match self.fills.get(component) {
+            Some(fill) if !self.spec.dtype.is_float() => code(self.spec.dtype, *fill, range),
+            _ => self.spec.fill,
         }
-        None if dtype == native => wire.fill.round_ties_even().clamp(dtype.range().0, dtype.range().1),
-        None => 0.0,
     }
 }

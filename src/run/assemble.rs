@@ -191,7 +191,8 @@ impl Assembler<'_> {
     }
 
     pub fn mapping(&self, place: &Place) -> Mapping {
-        Mapping { range: place.target.range, fill: place.output.spec.fill }
+        let range = place.target.range;
+        Mapping { range, fill: place.output.missing(place.component, range) }
     }
 
     /// Converts unrounded values to the output's type and puts them.

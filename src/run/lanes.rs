@@ -91,7 +91,7 @@ impl<'a> Engine<'a> {
             return Ok(None);
         }
         value.materialize(self.pool);
-        let src = self.windowed(a, value, 0, &graph.wires[a.inputs[0]], middle, volume);
+        let src = self.windowed(a, a.border, value, 0, &graph.wires[a.inputs[0]], middle, volume);
         let extents = Extents {
             src: src.view().shape(),
             middle: middle.shape(),

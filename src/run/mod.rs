@@ -15,6 +15,7 @@ pub mod outputs;
 pub mod prepass;
 pub mod program;
 pub mod read;
+mod repair;
 pub mod report;
 pub mod second;
 pub mod session;

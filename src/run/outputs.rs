@@ -32,17 +32,18 @@ pub fn journal_dir(plan: &Plan) -> PathBuf {
     Sink::work_dir(&plan.outputs.last().expect("a config has outputs").spec.path)
 }
 
-/// Whether output `o` is complete and made by this very config.
-pub fn is_complete(plan: &Plan, o: usize, hash: &str) -> bool {
-    matches!(
-        existing(&plan.outputs[o].spec.path),
-        Existing::Ours { complete: true, occlude: Some(attributes) } if attributes["config_hash"] == hash
-    )
+/// Whether output `o` is complete and made by the config and from the inputs that a journal's header names.
+pub fn is_complete(plan: &Plan, o: usize, header: &Value) -> bool {
+    let Existing::Ours { complete: true, occlude: Some(attributes) } = existing(&plan.outputs[o].spec.path) else {
+        return false;
+    };
+    let inputs = attributes["input"].as_array().into_iter().flatten().map(|i| &i["identity"]);
+    attributes["config_hash"] == header["config_hash"]
+        && header["inputs"].as_array().is_some_and(|wanted| inputs.eq(wanted))
 }
 
 /// Decides by what lies at the outputs' paths. Deletes only what this program wrote.
 pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwrite: bool) -> Result<Start> {
-    let hash = header["config_hash"].as_str().unwrap_or_default();
     if overwrite {
         // All are looked at before the first is deleted.
         for output in &plan.outputs {
@@ -66,7 +67,7 @@ pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwri
             return Err(refused(config, output, "exists; --resume continues it, --overwrite deletes it first"));
         }
     }
-    if (0..plan.outputs.len()).all(|o| is_complete(plan, o, hash)) {
+    if (0..plan.outputs.len()).all(|o| is_complete(plan, o, header)) {
         return Ok(Start::Complete);
     }
     let Some(earlier) = journal::Journal::read(&journal_dir(plan)) else {
@@ -84,7 +85,8 @@ pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwri
 fn no_journal(config: &Config, plan: &Plan, found: &[Existing]) -> Result<Start> {
     for (output, found) in plan.outputs.iter().zip(found) {
         if matches!(found, Existing::Ours { complete: true, .. }) {
-            let message = "is complete and was made with other settings; --overwrite deletes it first";
+            let message =
+                "is complete and was made with other settings or from another input; --overwrite deletes it first";
             return Err(refused(config, output, message));
         }
     }
@@ -119,7 +121,12 @@ fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Res
 /// Opens every output of a group that is not complete.
 pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], resume: bool) -> Result<Target> {
     let output = &plan.outputs[o];
-    let sink = Sink::create(output.spec.clone(), resume)?;
+    let range = range_of(output, globals);
+    let mut spec = output.spec.clone();
+    if output.auto_range.is_some() {
+        spec.fill = output.missing(0, range);
+    }
+    let sink = Sink::create(spec, resume)?;
     let dir = Sink::work_dir(&output.spec.path);
     let parts = output.spec.components.unwrap_or(1);
     let mut levels = Vec::new();
@@ -135,7 +142,7 @@ pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], r
         let shape = output.level(deepest).expect("level exists").shape;
         Spill::open(&dir.join(format!("cells.{deepest}")), shape, per_cell, size_of::<f64>())
     });
-    Ok(Target { sink, levels, cells: cells.transpose()?, range: range_of(output, globals) })
+    Ok(Target { sink, levels, cells: cells.transpose()?, range })
 }
 
 /// The values that map to 0 and the largest code, from the config or a pre-pass.
@@ -211,7 +218,7 @@ pub fn attributes(
         "stages": methods,
         "dtype": output.spec.dtype.numpy_name(),
         "value_range": range.filter(|_| integer),
-        "fill": json_number(output.spec.fill),
+        "fill": json_number(if output.auto_range.is_some() { output.missing(0, range) } else { output.spec.fill }),
         "polarity": output.openness.then_some("openness: 1 is open, 0 is occluded"),
         "channel": channel_names(config, output),
         "units": lattice.unit,

@@ -146,7 +146,7 @@ impl<'a> Session<'a> {
         header["globals"] = journal::header("", &[], 0, &Value::Null, &self.globals)["globals"].clone();
         for g in 0..self.plan.groups.len() {
             for &o in &self.plan.groups[g].outputs {
-                if !resume || !outputs::is_complete(&self.plan, o, &self.hash) {
+                if !resume || !outputs::is_complete(&self.plan, o, &header) {
                     let target = outputs::open_target(&self.plan, &self.plan.groups[g], o, &self.globals, resume)?;
                     self.targets[o] = Some(target);
                 } else if o + 1 < self.plan.outputs.len() {

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use super::lanes::gradient_out;
 use super::metrics::Metrics;
+use super::repair;
 use super::value::{Comp, Value};
 use crate::Result;
 use crate::brick::{Pool, Scratch, Voxels, gather};
@@ -131,7 +132,7 @@ impl<'a> Engine<'a> {
         let mut outputs = if step.streamed {
             self.sweep_streamed(id, &inputs_of(step, values), mask, region, volume, fetch, scratch)?
         } else {
-            self.compute(id, &inputs_of(step, values), mask, region, volume, scratch)?
+            self.compute(id, &inputs_of(step, values), mask, region, volume, step.border, scratch)?
         };
         if let MaskValue::Some(needed) = mask {
             for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
@@ -169,7 +170,10 @@ impl<'a> Engine<'a> {
                 Value { dtype: v.dtype, region: one, comps: comps.collect() }
             })
             .collect();
-        let outputs = self.compute(id, &small.iter().collect::<Vec<_>>(), &MaskValue::All, one, one, scratch)?;
+        // Its windows end inside the volume: around the one voxel lies its own value, not the border's.
+        let border = if matches!(step.border, Border::Constant(_)) { Border::Nearest } else { step.border };
+        let small: Vec<&Value> = small.iter().collect();
+        let outputs = self.compute(id, &small, &MaskValue::All, one, one, border, scratch)?;
         let spread = |value: Value| {
             let comps = value.comps.iter().map(|c| match c {
                 Comp::Const(v) => Comp::Const(*v),
@@ -180,6 +184,8 @@ impl<'a> Engine<'a> {
         Ok(Some(outputs.into_iter().map(spread).collect()))
     }
 
+    /// `border` is the step's, or what stands for it around a constant.
+    #[allow(clippy::too_many_arguments)]
     fn compute(
         &self,
         id: StepId,
@@ -187,6 +193,7 @@ impl<'a> Engine<'a> {
         mask: &MaskValue,
         region: Region,
         volume: Region,
+        border: Border,
         scratch: &mut Scratch,
     ) -> Result<Vec<Value>> {
         let step = &self.plan.graph.steps[id];
@@ -211,7 +218,7 @@ impl<'a> Engine<'a> {
                 )?;
             }
             StepKind::Gradient { size, weight, spacing, channels, stored } => {
-                let src = self.windowed(step, inputs[0], 0, input_wire, region, volume);
+                let src = self.windowed(step, border, inputs[0], 0, input_wire, region, volume);
                 let out = gradient_out(channels, &mut outputs);
                 let affine = if *stored { Affine::IDENTITY } else { src.affine };
                 let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: src.missing };
@@ -233,9 +240,10 @@ impl<'a> Engine<'a> {
             | StepKind::Moments4 { .. }
             | StepKind::Gaussian { .. } => {
                 for c in 0..input_wire.components {
-                    let src = self.windowed(step, inputs[0], c, input_wire, region, volume);
+                    let src = self.windowed(step, border, inputs[0], c, input_wire, region, volume);
                     self.windows(id, &src, &mut outputs, c, &mut cx)?;
-                    repair_missing(&wires, inputs[0], c, input_wire, &mut outputs, region);
+                    repair::missing(&wires, inputs[0], c, input_wire, &mut outputs, region);
+                    repair::undefined(&wires, inputs[0], c, input_wire, &mut outputs, region);
                     src.recycle(self.pool);
                 }
             }
@@ -313,10 +321,11 @@ impl<'a> Engine<'a> {
     }
 
     fn pointwise(&self, step: &Step, inputs: &[&Value], outputs: &mut [Value], region: Region) {
-        let wire = |i: usize| &self.plan.graph.wires[step.inputs[i]];
-        let affine = |i: usize| (wire(i).affine, wire(i).missing);
         // A component of an input: the same one, or the only one.
-        let part = |i: usize, c: usize| inputs[i].view(c.min(inputs[i].comps.len() - 1), region);
+        let part = |i: usize, c: usize| -> pointwise::Operand {
+            let wire = &self.plan.graph.wires[step.inputs[i]];
+            (inputs[i].view(c.min(inputs[i].comps.len() - 1), region), wire.affine, wire.missing)
+        };
         match &step.kind {
             StepKind::Transfer { points, channels } => {
                 let (mut opacity, mut rgb) = (None, None);
@@ -327,8 +336,7 @@ impl<'a> Engine<'a> {
                         TransferChannel::Rgb => rgb = Some(three(views)),
                     }
                 }
-                let (a, missing) = affine(0);
-                pointwise::transfer(part(0, 0), a, missing, points, opacity, rgb);
+                pointwise::transfer(part(0, 0), points, opacity, rgb);
             }
             kind => {
                 for c in 0..outputs[0].comps.len() {
@@ -345,18 +353,14 @@ impl<'a> Engine<'a> {
                         }
                         StepKind::AmbientLight { k } => pointwise::ambient_light(part(0, c), part(1, c), *k, dst),
                         StepKind::Combine { kind } => {
-                            let parts: Vec<_> = (0..inputs.len())
-                                .map(|i| {
-                                    let (a, missing) = affine(i);
-                                    (part(i, c), a, missing)
-                                })
-                                .collect();
+                            let parts: Vec<_> = (0..inputs.len()).map(|i| part(i, c)).collect();
                             pointwise::combine(&parts, *kind, dst);
                         }
                         StepKind::Divide { by } => {
                             let max = Plan::global(&self.globals, *by)[1];
                             let slope = if max > 0.0 && max.is_finite() { 1.0 / max } else { 1.0 };
-                            pointwise::scale(part(0, c), Affine { slope, intercept: 0.0 }, None, dst);
+                            let (view, ..) = part(0, c);
+                            pointwise::scale(view, Affine { slope, intercept: 0.0 }, None, dst);
                         }
                         _ => unreachable!("window kernels do not come here"),
                     }
@@ -365,10 +369,13 @@ impl<'a> Engine<'a> {
         }
     }
 
-    /// The input of a window kernel: the box grown by the reach, clipped or extended by the border rule.
+    /// The input of a window kernel: the box grown by the reach, clipped or extended by the border rule. Where the step's
+    /// border makes floats of the voxels it does so everywhere, so that a brick at the edge has the bits of one inside.
+    #[allow(clippy::too_many_arguments)]
     pub(super) fn windowed<'v>(
         &self,
         step: &Step,
+        border: Border,
         value: &'v Value,
         comp: usize,
         wire: &Wire,
@@ -384,12 +391,12 @@ impl<'a> Engine<'a> {
             affine: wire.affine,
             missing: wire.missing,
         };
-        if step.border == Border::Clip || wanted == inside {
+        let (outside, promote) = wire.beyond(step.border);
+        if !promote && (border == Border::Clip || wanted == inside) {
             return whole;
         }
         // What the rule reads lies in the value's box: clamped and mirrored indices stay within the reach of the edge.
         let src = value.view(comp, value.region);
-        let (outside, promote) = wire.beyond(step.border);
         let at = wanted.offset_of(&region);
         let mut padded;
         let (dtype, missing) = if promote { (wire.dtype.result(), None) } else { (wire.dtype, wire.missing) };
@@ -397,19 +404,11 @@ impl<'a> Engine<'a> {
             let mut floats = self.pool.take(dtype, value.region.voxels());
             pointwise::scale(src, Affine::IDENTITY, wire.missing, floats.view_mut(value.region.shape()));
             padded = self.pool.take(dtype, wanted.voxels());
-            extend_any(
-                floats.view(value.region.shape()),
-                value.region,
-                &mut padded,
-                wanted,
-                volume,
-                step.border,
-                outside,
-            );
+            extend_any(floats.view(value.region.shape()), value.region, &mut padded, wanted, volume, border, outside);
             self.pool.put(floats);
         } else {
             padded = self.pool.take(dtype, wanted.voxels());
-            extend_any(src, value.region, &mut padded, wanted, volume, step.border, outside);
+            extend_any(src, value.region, &mut padded, wanted, volume, border, outside);
         }
         Windowed { src: Src::Owned(padded, wanted.shape()), at, voxel: region.lo, affine: wire.affine, missing }
     }
@@ -484,44 +483,6 @@ fn fill_where(comp: &mut Comp, needed: &[u8], fill: f64) {
     if let Comp::Voxels(voxels) = comp {
         crate::with_voxels!(voxels, v => set(v, needed, fill));
     }
-}
-
-/// Integer outputs (min, max) of a missing voxel hold the missing value, so that later stages see it as missing.
-fn repair_missing(
-    wires: &[&Wire],
-    input: &Value,
-    comp: usize,
-    input_wire: &Wire,
-    outputs: &mut [Value],
-    region: Region,
-) {
-    let Some(missing) = input_wire.missing else { return };
-    for (wire, value) in wires.iter().zip(outputs) {
-        if wire.dtype.is_float() || wire.missing.is_none() {
-            continue;
-        }
-        let src = input.view(comp, region);
-        let [nz, ny, nx] = region.shape();
-        let Comp::Voxels(out) = &mut value.comps[comp] else { continue };
-        let mut i = 0;
-        for z in 0..nz {
-            for y in 0..ny {
-                for x in 0..nx {
-                    if src.at_f64([z, y, x]) == missing as f64 {
-                        set_at(out, i, missing as f64);
-                    }
-                    i += 1;
-                }
-            }
-        }
-    }
-}
-
-fn set_at(voxels: &mut Voxels, index: usize, value: f64) {
-    fn set<T: Voxel>(v: &mut [T], index: usize, value: f64) {
-        v[index] = T::from_f64(value);
-    }
-    crate::with_voxels!(voxels, v => set(v, index, value));
 }
 
 pub(super) fn view_mut(value: &mut Value, comp: usize) -> AnyViewMut<'_> {

@@ -238,6 +238,55 @@ def bounds(folder, stage, close):
             close(f"{what} bounds", got, want, one)
 
 
+def opposed(folder, stage, close):
+    """Windows that hold both infinities: 1 and 0 at them, `fill` beside them, NaN at missing voxels alone."""
+    v = RNG.normal(size=(5, 6, 12)).astype("<f4")
+    v[2, 3, 4], v[2, 3, 6], v[1, 3, 5] = np.inf, -np.inf, np.nan
+    np.save(folder / "a.npy", v)
+    both = np.zeros(v.shape, bool)
+    both[1:4, 2:5, 5] = True
+    for method in ("cdf_power", "gaussian_cdf", "chebyshev", "chebyshev_literal", "beta"):
+        got = stage(folder, "path = 'a.npy'", f"op = 'ambient_occlusion'\nmethod = '{method}'\nradius = 1\nfill = 0.25")
+        want = np.where(np.isnan(v), np.nan, np.where(both, 0.25, got))
+        want[2, 3, 4], want[2, 3, 6] = 1, 0
+        close(f"{method} between infinities", got, want, 0)
+
+
+def stored(folder, stage, close):
+    """Stages that look at one voxel take inputs in scaled units, and their missing voxels as missing."""
+    v = RNG.integers(0, 256, (3, 4, 5)).astype("u1")
+    v[0, 0, 0] = 9
+    np.save(folder / "a.npy", v)
+    s = np.where(v == 9, np.nan, 1 - v / 255)
+    source = f"path = 'a.npy'\nslope = {-1 / 255}\nintercept = 1\nnodata = 9"
+    body = "op = 'window'\nlow = 0.2001\nhigh = 0.7001"
+    close("window of a scaled input", stage(folder, source, body), np.where(s < 0.2001, 0, np.where(s > 0.7001, 1, s)), 1e-6)
+    body = "op = 'opacity_modulation'\nby = 'a'\nsigma_max2 = 0.5"
+    close("modulation of a scaled input", stage(folder, source, body), s * np.minimum(s / 0.5, 1), 1e-6)
+    # Missing voxels hold `fill` in integers too, whatever their range turns out to be.
+    v = v.astype("<i2") - 100
+    np.save(folder / "a.npy", v)
+    got = stage(folder, "path = 'a.npy'\nnodata = -91", "op = 'box'\nradius = 0\nfill = 30", dtype="u16", range="auto")
+    low, high = v[v != -91].min(), v[v != -91].max()
+    close("missing voxels by a range found", got, np.rint((np.where(v == -91, 30, v) - low) / (high - low) * 65535), 0)
+
+
+def beyond(folder, stage, close):
+    """Constant borders: bricks of one value inside the volume, and constants that the input's type cannot hold."""
+    v = RNG.integers(0, 9, (36, 35, 37)).astype("u1")
+    v[14:34, 14:34, 14:34] = 5
+    np.save(folder / "a.npy", v)
+    for constant in (7.0, 7.5):
+        pad = np.pad(v.astype(float), 1, constant_values=constant)
+        near = [pad[tuple(slice(i, i + n) for i, n in zip(o, v.shape))] for o in itertools.product(range(3), repeat=3)]
+        border = f"radius = 1\nborder = {{ constant = {constant} }}"
+        for channel, want in (("min", np.min(near, 0)), ("max", np.max(near, 0)), ("mean", np.mean(near, 0))):
+            got = stage(folder, "path = 'a.npy'", f"op = 'box'\n{border}", f"s.{channel}")
+            close(f"{channel} beside a border of {constant}", got, want, 1e-6)
+        got = stage(folder, "path = 'a.npy'", f"op = 'ambient_occlusion'\nmethod = 'exact'\n{border}")
+        close(f"rank beside a border of {constant}", got, np.mean(np.array(near) <= v, axis=0), 1e-6)
+
+
 def run_all(folder, stage, close):
-    for part in (weights, holes, rounded, scaled, halves, bounds):
+    for part in (weights, holes, rounded, scaled, halves, bounds, opposed, stored, beyond):
         part(folder, stage, close)

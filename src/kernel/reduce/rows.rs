@@ -161,6 +161,18 @@ crate::multiversion! {
     fn extreme[S: Voxel](max: bool, rows: &[&[S]], halve_x: bool, out: &mut [f64]) -> bool = extreme_inner;
 }
 
+/// The square with the sign of `v`: a standard deviation has none, but the fill of excluded voxels may, and comes back by
+/// [`signed_root`].
+#[inline(always)]
+pub(super) fn signed_square(v: f64) -> f64 {
+    v * v.abs()
+}
+
+#[inline(always)]
+pub(super) fn signed_root(v: f64) -> f64 {
+    v.abs().sqrt().copysign(v)
+}
+
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 fn moments_inner<S: Voxel>(
@@ -174,7 +186,7 @@ fn moments_inner<S: Voxel>(
 ) -> bool {
     let add = |a: f64, b: f64| a + b;
     match std {
-        true => vertical(variance, line, |v| v.to_f64() * v.to_f64(), add),
+        true => vertical(variance, line, |v| signed_square(v.to_f64()), add),
         false => vertical(variance, line, S::to_f64, add),
     }
     pairs(line, halve_x, inner, add);
@@ -459,7 +471,7 @@ fn values_inner(
         Reduce::Moments => {
             for (((d, i), b), n) in out.iter_mut().zip(inner).zip(between).zip(count) {
                 let variance = i / n.abs() + b / n.abs();
-                *d = if std { variance.sqrt() } else { variance };
+                *d = if std { signed_root(variance) } else { variance };
             }
         }
         Reduce::Min | Reduce::Max | Reduce::Stride => out.copy_from_slice(value),

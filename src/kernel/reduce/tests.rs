@@ -246,6 +246,20 @@ fn excluded_voxels_enter_only_where_nothing_else_is() {
 }
 
 #[test]
+fn a_negative_fill_of_a_standard_deviation_stays_negative() {
+    let value = Voxels::F32(vec![-7.0, -7.0, -7.0, 2.0, -7.0, -7.0]);
+    for needed in [[0, 0, 0, 1, 0, 0], [0; 6]] {
+        let case = Case { shape: [1, 1, 6], mean: value.clone(), value: value.clone(), needed: Some(needed.to_vec()) };
+        let levels = chain(&case, Reduce::Moments, true, &[[false, false, true]; 3], Level::detect());
+        let of = |l: usize, x| levels[l].at([0, 0, x]);
+        assert_eq!([of(0, 0), of(0, 2), of(1, 1)], [-7.0; 3]);
+        if needed[3] == 1 {
+            assert_eq!([of(0, 1), of(1, 0), of(2, 0)], [2.0; 3]);
+        }
+    }
+}
+
+#[test]
 fn weighted_means_of_all_levels_equal_the_mean_of_level_0() {
     let case = Case::random([13, 21, 35], DType::U8, 0.0, 0.0, 3);
     let total: f64 = (0..case.value.len()).map(|i| case.value.at(i)).sum();

@@ -87,7 +87,8 @@ impl Flat {
         let (size, n) = (spec.dtype.size(), region.shape());
         // Runs of voxels that follow each other both in the file and in the box.
         let rows = if n[2] == nx { n[1] } else { 1 };
-        let planes = if rows == ny && n[1] == ny { n[0] } else { 1 };
+        // A volume of one row per plane has full planes only where its rows are full.
+        let planes = if n[2] == nx && n[1] == ny { n[0] } else { 1 };
         let run = planes * rows * n[2] * size;
         let bytes = match chunk {
             Encoded::Bytes(bytes) => Cow::Borrowed(&bytes[..]),
