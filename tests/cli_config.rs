@@ -461,7 +461,8 @@ fn entries(node: &Node) -> &tree::Table {
 
 /// Every table of the reference config that holds keys: section, op, table, its text.
 fn tables(root: &tree::Table) -> Vec<(Section, String, tree::Table)> {
-    let mut found = vec![(Section::Run, String::new(), entries(tree::find(root, "run").unwrap()).clone())];
+    let single = |(section, name)| (section, String::new(), entries(tree::find(root, name).unwrap()).clone());
+    let mut found: Vec<_> = [(Section::Run, "run"), (Section::Pareto, "pareto")].map(single).into();
     for (kind, section) in [("input", Section::Input), ("stage", Section::Stage), ("output", Section::Output)] {
         for (_, node) in entries(tree::find(root, kind).unwrap()) {
             let t = entries(node).clone();
@@ -510,9 +511,13 @@ fn reference_parses_to_the_defaults() {
     // Take every key away whose value is its default; nothing may change.
     let mut document: toml_edit::DocumentMut = text.parse().unwrap();
     let mut taken = 0;
-    for (kind, section) in
-        [("run", Section::Run), ("input", Section::Input), ("stage", Section::Stage), ("output", Section::Output)]
-    {
+    for (kind, section) in [
+        ("run", Section::Run),
+        ("input", Section::Input),
+        ("stage", Section::Stage),
+        ("output", Section::Output),
+        ("pareto", Section::Pareto),
+    ] {
         let table = document[kind].as_table_mut().unwrap();
         let names: Vec<String> = table.iter().map(|(n, _)| n.to_string()).collect();
         let strip = |t: &mut toml_edit::Table| {
@@ -527,7 +532,7 @@ fn reference_parses_to_the_defaults() {
                 }
             }
         };
-        if section == Section::Run {
+        if matches!(section, Section::Run | Section::Pareto) {
             Some(table).into_iter().for_each(strip);
         } else {
             let mut strip = strip;

@@ -32,10 +32,15 @@ pub enum Command {
     Preview(PreviewArgs),
     /// Measure time against error over the methods and settings of the config's [pareto] table
     ///
-    /// Keys of [pareto]: stage = the stage that is varied; reference = the keys in which a combination's
-    /// reference differs from it, e.g. { method = "exact" }; vary = { method = ["cdf_power", "chebyshev"], radius = [5, 10] }, whose combinations are run;
-    /// folder = where outputs, pareto.csv, pareto.json and pareto.svg go (default "pareto"); repeat = runs per
-    /// combination, whose median counts, after one more to warm up where it is above 1 (default 1); keep = whether volumes are kept (default false).
+    /// Keys of [pareto]: stage = the stage that is varied (its main channel is measured, or "stage.channel");
+    /// vary = { method = ["cdf_power", "chebyshev"], radius = [5, 10] }, whose combinations are run (device = [..] varies
+    /// run.device); reference = the keys in which a combination's truth differs from it, e.g. { method = "exact" } (default:
+    /// the truth that fits: exact counts in the box or ball, obscurance by 6000 Fibonacci directions, means and variances by
+    /// two passes in f64); sample = how much is judged, in bricks of 64^3 chosen by hash: "all", a number of bricks, a share
+    /// such as "5 %", or "auto" (default: 512 bricks where there are more), the truth being computed only there; seed = which
+    /// bricks (default 0); folder = where outputs, pareto.csv, pareto.json and pareto.svg go (default "pareto"); repeat = runs
+    /// per combination, whose median counts, after one more to warm up where it is above 1 (default 1); keep = whether volumes
+    /// are kept (default false).
     Pareto(ParetoArgs),
     /// Print the JSON Schema of the config
     Schema,

@@ -109,7 +109,7 @@ fn value_range(volume: &Volume, components: usize, cancel: &Cancel) -> Result<f6
 
 /// Running sums over pairs.
 #[derive(Default)]
-struct Sums {
+pub struct Sums {
     /// Of A - B; its mean is the bias.
     signed: Moments,
     absolute: f64,
@@ -121,7 +121,8 @@ struct Sums {
 }
 
 impl Sums {
-    fn add(&mut self, a: &[f64], b: &[f64]) {
+    /// Takes in pairs; those with a NaN do not count.
+    pub fn add(&mut self, a: &[f64], b: &[f64]) {
         let difference: Vec<f64> = a.iter().zip(b).map(|(a, b)| if a == b { 0.0 } else { a - b }).collect();
         // Sums per plane, so that long volumes lose no digits.
         let (mut absolute, mut squares) = (0.0, 0.0);
@@ -137,14 +138,15 @@ impl Sums {
         self.signed = self.signed.merge(Moments::of(&difference));
     }
 
-    fn similar(&mut self, (mean, windows): (f64, u64)) {
+    /// Takes in a mean similarity and its number of windows.
+    pub fn similar(&mut self, (mean, windows): (f64, u64)) {
         if windows > 0 {
             self.similarity.0 += mean * windows as f64;
             self.similarity.1 += windows;
         }
     }
 
-    fn finish(self) -> Difference {
+    pub fn finish(self) -> Difference {
         let n = self.signed.n + self.signed.infinite;
         let mean = |sum: f64| if n == 0 { f64::NAN } else { sum / n as f64 };
         Difference {

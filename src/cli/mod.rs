@@ -4,7 +4,6 @@ pub mod args;
 pub mod attributes;
 pub mod cmd_compare;
 pub mod cmd_info;
-pub mod cmd_pareto;
 pub mod cmd_plan;
 pub mod cmd_preview;
 pub mod cmd_run;
@@ -12,7 +11,7 @@ pub mod draw;
 pub mod human;
 pub mod messages;
 pub mod moments;
-pub mod pareto_bands;
+pub mod pareto;
 pub mod plot;
 pub mod progress;
 pub mod reader;
@@ -58,7 +57,7 @@ fn command(cli: &Cli) -> Result<ExitCode> {
         Command::Info(args) => cmd_info::run(args)?,
         Command::Compare(args) => return cmd_compare::run(args),
         Command::Preview(args) => cmd_preview::run(args)?,
-        Command::Pareto(args) => cmd_pareto::run(args, cli.quiet)?,
+        Command::Pareto(args) => pareto::run(args, cli.quiet)?,
         Command::Schema => messages::result_json(&config::schema())?,
         Command::Completions { shell } => {
             let mut text = Vec::new();

@@ -81,11 +81,33 @@ fn input(path: &Path, level: usize, raw: &RawArgs) -> Result<Input> {
 impl Volume {
     /// Opens a volume and makes its voxels readable (gzip is unpacked into a temporary folder).
     pub fn open(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
-        let attributes = attributes::read(path);
-        let mut source = Source::open(&described(path, level, raw, &attributes)?)?;
-        if attributes.complete() == Some(false) {
+        let volume = Volume::open_level(path, level, raw, cancel)?;
+        if volume.attributes.complete() == Some(false) {
             messages::warning(&format!("{}: this output was not finished", path.display()));
         }
+        Ok(volume)
+    }
+
+    /// Level 0 of an output that may be unfinished, of which only what was written is looked at.
+    pub fn open_part(path: &Path, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
+        Volume::open_level(path, 0, raw, cancel)
+    }
+
+    /// An input of a config, with its overrides; what has to be unpacked goes to `folder`.
+    pub fn of_input(given: &Input, folder: &Path, cancel: &Cancel) -> Result<Volume> {
+        let path = match &given.kind {
+            InputKind::Path { path, .. } => path.clone(),
+            InputKind::Synthetic { .. } => PathBuf::from(&given.name),
+        };
+        let mut source = Source::open(given)?;
+        source.prepare(folder, &|_| !cancel.is_cancelled())?;
+        cancel.check()?;
+        Ok(Volume::new(&path, source, Attributes::default(), None))
+    }
+
+    fn open_level(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
+        let attributes = attributes::read(path);
+        let mut source = Source::open(&described(path, level, raw, &attributes)?)?;
         let scratch = if source.spool_bytes() > 0 { Some(Scratch::new()?) } else { None };
         let folder = scratch.as_ref().map_or_else(std::env::temp_dir, |s| s.0.clone());
         source.prepare(&folder, &|_| !cancel.is_cancelled())?;

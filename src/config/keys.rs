@@ -13,6 +13,7 @@ pub enum Section {
     Output,
     /// The inline table `where` of a stage.
     Where,
+    Pareto,
 }
 
 /// What stands where a key is not given.
@@ -116,7 +117,7 @@ const fn stage(
 }
 
 use self::Default::{Absent, Required, Toml};
-use self::Section::{Input, Output, Where};
+use self::Section::{Input, Output, Pareto, Where};
 
 /// The table.
 #[rustfmt::skip]
@@ -167,7 +168,7 @@ pub const KEYS: &[Key] = &[
     stage(&["ambient_occlusion"], "ties", Kind::Choice(&["le", "mid"]), Toml("\"le\""), "how voxels equal to the centre count"),
     stage(&["ambient_occlusion"], "region", Kind::Choice(&["box", "equal_volume", "ball"]), Toml("\"box\""), "shape of the window; ball for method exact only"),
     stage(&["ambient_occlusion", "obscurance"], "solid", Kind::Choice(&["high", "low"]), Toml("\"high\""), "whether larger or smaller scaled values are solid"),
-    stage(&["obscurance"], "directions", Kind::Int { min: 1, max: 4096 }, Toml("42"), "12, 42 or 162; any count with set = \"fibonacci\""),
+    stage(&["obscurance"], "directions", Kind::Int { min: 1, max: 8191 }, Toml("42"), "12, 42 or 162; any count with set = \"fibonacci\""),
     stage(&["obscurance"], "set", Kind::Choice(&["icosahedron", "fibonacci"]), Toml("\"icosahedron\""), "family of directions"),
     stage(&["obscurance"], "rho", Kind::Choice(&["step", "linear", "exponential", "sqrt"]), Toml("\"sqrt\""), "dimming of an occluder with distance"),
     stage(&["obscurance"], "max_distance", Kind::Distance, Toml("64"), "reach; voxels of the finest axis, or physical"),
@@ -206,6 +207,15 @@ pub const KEYS: &[Key] = &[
     key(Output, "codec", Kind::Codec, Toml("\"blosc-lz4\""), "compression of chunks"),
     key(Output, "levels", Kind::Levels, Toml("\"auto\""), "levels of the pyramid; flat files have one"),
     key(Output, "reduce", Kind::Choice(&["mean", "min", "max", "stride", "moments"]), Toml("\"mean\""), "how cells of coarser levels are made"),
+    // [pareto]
+    key(Pareto, "stage", Kind::Ref, Required, "stage that is varied; its main channel is measured, or stage.channel"),
+    key(Pareto, "vary", Kind::Vary, Required, "values by key of the stage, whose combinations are run; device = [..] varies run.device"),
+    key(Pareto, "reference", Kind::StageKeys, Absent("the truth that fits: exact counts, obscurance by 6000 Fibonacci directions, means and variances by two passes in f64"), "keys in which a combination's truth differs from it"),
+    key(Pareto, "sample", Kind::Sample, Toml("\"auto\""), "how much of the volume is judged, in bricks of 64^3 chosen by hash; auto: 512 of them where there are more"),
+    key(Pareto, "seed", Kind::Int { min: 0, max: i64::MAX }, Toml("0"), "which bricks the sample holds"),
+    key(Pareto, "folder", Kind::Path, Toml("\"pareto\""), "where outputs, pareto.csv, pareto.json and pareto.svg go"),
+    key(Pareto, "repeat", Kind::Int { min: 1, max: 100 }, Toml("1"), "runs per combination, whose median counts, after one more to warm up where it is above 1"),
+    key(Pareto, "keep", Kind::Bool, Toml("false"), "whether the volumes of runs and truths are kept"),
 ];
 
 /// Keys of a section (for stages: of one `op`), in the table's order.

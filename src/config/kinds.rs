@@ -69,8 +69,12 @@ pub enum Kind {
     Rgb,
     /// Rows of a transfer table.
     Points,
-    /// Checked elsewhere.
-    AnyTable,
+    /// Keys of a stage with values.
+    StageKeys,
+    /// Keys with lists of values.
+    Vary,
+    /// How much of a volume is judged.
+    Sample,
 }
 
 /// Largest extent that a config may name: products of three stay within `u64`.
@@ -127,7 +131,11 @@ impl Kind {
             Kind::Points => {
                 "[[value, opacity, r, g, b], ...] with ascending values, opacity in 0..1, colours of at least 0".into()
             }
-            Kind::AnyTable => "a table".into(),
+            Kind::StageKeys => "stage keys, e.g. { method = \"exact\" }".into(),
+            Kind::Vary => {
+                "lists of values by stage key (device: of run.device), e.g. { method = [\"cdf_power\"], radius = [5, 10] }".into()
+            }
+            Kind::Sample => "\"auto\", \"all\", a number of bricks from 1 up, or a share such as \"5 %\"".into(),
         }
     }
 
@@ -176,7 +184,11 @@ impl Kind {
             Kind::Border => json!({"anyOf": [{"enum": ["clip", "nearest", "reflect"]},
                 {"type": "object", "properties": {"constant": {"type": "number"}}, "required": ["constant"],
                  "additionalProperties": false}]}),
-            Kind::Where | Kind::AnyTable => json!({"type": "object"}),
+            Kind::Where | Kind::StageKeys => json!({"type": "object"}),
+            Kind::Vary => json!({"type": "object", "minProperties": 1,
+                "additionalProperties": {"type": "array", "minItems": 1}}),
+            Kind::Sample => json!({"anyOf": [{"enum": ["auto", "all"]}, {"type": "integer", "minimum": 1},
+                {"type": "string", "pattern": "^\\s*[0-9.eE+-]+\\s*%$"}]}),
             Kind::Numbers => json!({"anyOf": [{"type": "number"},
                 {"type": "array", "items": {"type": "number"}, "minItems": 1}]}),
             Kind::Size => json!({"enum": [3, 5]}),

@@ -1,7 +1,7 @@
 //! The configuration: TOML text to typed, checked values.
 //!
 //! [`tree`] keeps lines and applies `--set`; [`keys`] is the one table of keys; [`section`] reads a table through it;
-//! [`inputs`], [`stages`] and [`outputs`] build the [`model`]; [`check`] looks at the graph as a whole.
+//! [`inputs`], [`stages`], [`outputs`] and [`mod@pareto`] build the [`model`]; [`check`] looks at the graph as a whole.
 
 pub mod check;
 pub mod hash;
@@ -10,6 +10,7 @@ pub mod keys;
 pub mod kinds;
 pub mod model;
 pub mod outputs;
+pub mod pareto;
 pub mod provenance;
 pub mod read;
 pub mod schema;
@@ -24,6 +25,7 @@ use std::path::{Path, PathBuf};
 pub use hash::config_hash;
 pub use keys::op_channels;
 pub use model::*;
+pub use pareto::{Pareto, Sample};
 pub use provenance::{provenance, stage_constants, stage_parameters};
 pub use schema::schema;
 
@@ -87,7 +89,7 @@ fn build(text: &str, file: &Path, sets: &[String]) -> Result<Config> {
         outputs: members(&root, "output")?
             .map(|(name, node)| outputs::read(name, node, base, &names))
             .collect::<Result<_>>()?,
-        pareto: read_pareto(&root)?,
+        pareto: tree::find(&root, "pareto").map(|n| pareto::read(n, base, &names)).transpose()?,
     };
     check::check(&config)?;
     Ok(config)
@@ -101,14 +103,6 @@ fn members<'a>(root: &'a Table, kind: &str) -> Result<std::slice::Iter<'a, (Stri
         Some(node) => Err(error(kind, node.line, format!("got {node}; expected tables [{kind}.NAME]"))),
     }
     .map(|iter: std::slice::Iter<'a, (String, Node)>| iter)
-}
-
-fn read_pareto(root: &Table) -> Result<Option<toml::Table>> {
-    match tree::find(root, "pareto") {
-        None => Ok(None),
-        Some(Node { value: Value::Table(t), .. }) => Ok(Some(read::toml_table(t))),
-        Some(node) => Err(error("pareto", node.line, format!("got {node}; expected a table"))),
-    }
 }
 
 fn read_run(root: &Table, base: &Path) -> Result<Run> {

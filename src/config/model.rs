@@ -18,8 +18,7 @@ pub struct Config {
     pub inputs: Vec<Input>,
     pub stages: Vec<StageNode>,
     pub outputs: Vec<Output>,
-    /// The `[pareto]` table as typed, checked by the command that reads it.
-    pub pareto: Option<toml::Table>,
+    pub pareto: Option<super::Pareto>,
 }
 
 /// Where a thing stands in the config: names it in errors.

@@ -19,7 +19,7 @@ pub fn schema() -> Value {
             "input": named(input()),
             "stage": named(json!({"oneOf": stage})),
             "output": json!({"type": "object", "minProperties": 1, "additionalProperties": object(Section::Output, "")}),
-            "pareto": {"type": "object", "description": "methods and settings that `occlude pareto` compares"},
+            "pareto": object(Section::Pareto, ""),
         },
         "required": ["output"],
         "additionalProperties": false,
@@ -77,6 +77,7 @@ pub fn rows() -> impl Iterator<Item = (String, String, String, &'static str)> {
             Section::Stage => "stage.NAME",
             Section::Output => "output.NAME",
             Section::Where => "stage.NAME.where",
+            Section::Pareto => "pareto",
         };
         let default = match key.default {
             Default::Toml(text) => text.to_string(),

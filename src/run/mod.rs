@@ -33,6 +33,7 @@ pub use session::Session;
 
 use crate::Result;
 use crate::config::Config;
+use crate::grid::Region;
 
 /// Runs the whole job: plans, opens, streams every task that is not done, finishes.
 ///
@@ -44,4 +45,15 @@ pub fn run(config: &Config, options: &RunOptions, progress: &dyn Progress) -> Re
     tracing::info!(open = tasks.len(), of = session.task_count(), "tasks");
     session.run_tasks(&tasks)?;
     session.finish()
+}
+
+/// Computes only the bricks that meet one of these boxes of the volume (see [`Session::run_boxes`]); the outputs stay
+/// unfinished.
+///
+/// # Errors
+/// As for [`run`].
+pub fn run_part(config: &Config, options: &RunOptions, progress: &dyn Progress, boxes: &[Region]) -> Result<Report> {
+    let session = Session::open(config, options, progress)?;
+    session.run_boxes(boxes)?;
+    Ok(session.report())
 }

@@ -215,12 +215,22 @@ impl<'a> Session<'a> {
 
     /// Streams the bricks of these tasks, group by group, marking each task as it finishes.
     pub fn run_tasks(&self, tasks: &[usize]) -> Result<()> {
+        self.run_bricks(tasks, None)
+    }
+
+    /// Streams only the bricks that meet one of these boxes of the volume. No task counts as done, and what was written is
+    /// there to be read: whole chunks that the boxes cover. Outputs of one task per file want `shard = "none"`.
+    pub fn run_boxes(&self, boxes: &[Region]) -> Result<()> {
+        self.run_bricks(&self.open_tasks(), Some(boxes))
+    }
+
+    fn run_bricks(&self, tasks: &[usize], only: Option<&[Region]>) -> Result<()> {
         for (g, group) in self.plan.groups.iter().enumerate() {
             let own = |t: &usize| (group.first_task..group.first_task + group.task_count()).contains(t);
             let mine: Vec<usize> = tasks.iter().copied().filter(own).collect();
             self.count_resumed(group);
             if !mine.is_empty() {
-                self.stream_group(g, &mine)?;
+                self.stream_group(g, &mine, only)?;
             }
         }
         Ok(())
@@ -235,7 +245,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    fn stream_group(&self, g: usize, tasks: &[usize]) -> Result<()> {
+    fn stream_group(&self, g: usize, tasks: &[usize], only: Option<&[Region]>) -> Result<()> {
         let group = &self.plan.groups[g];
         let program = Program::of_group(&self.plan, group);
         let engine = self.engine();
@@ -243,7 +253,10 @@ impl<'a> Session<'a> {
         let mut slots = Vec::new();
         for &task in tasks {
             let region = group.task_region(task - group.first_task);
-            let bricks = group.bricks(region);
+            let mut bricks = group.bricks(region);
+            if let Some(boxes) = only {
+                bricks.retain(|brick| boxes.iter().any(|b| !b.clip(brick).is_empty()));
+            }
             slots.push(TaskSlot::new(task, region, bricks.len()));
             work.extend(bricks.into_iter().map(|brick| Work { brick, slot: slots.len() - 1 }));
         }
@@ -251,7 +264,7 @@ impl<'a> Session<'a> {
         let assembler = Assembler { plan: &self.plan, group, targets, pool, level, gpu };
         let deliver =
             |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
-        let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items);
+        let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items, only.is_none());
         let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
         let tick = || {
             let (bricks, voxels) = self.metrics.done();
@@ -266,8 +279,8 @@ impl<'a> Session<'a> {
         engine
     }
 
-    /// Stores a brick's chunks; after the last brick of a task, commits and marks it.
-    fn write(&self, group: &Group, slot: &TaskSlot, items: Vec<Item>) -> Result<()> {
+    /// Stores a brick's chunks; after the last brick of a task, commits it, and marks it where it is `whole`.
+    fn write(&self, group: &Group, slot: &TaskSlot, items: Vec<Item>, whole: bool) -> Result<()> {
         for item in items {
             let target = self.targets[item.output].as_ref().expect("bricks go to open outputs");
             let bytes = target.sink.put(item.dataset, item.component, item.region, item.chunk)?;
@@ -280,7 +293,7 @@ impl<'a> Session<'a> {
                     outputs::commit_task(group, &self.plan.outputs[o], target, slot.region)?;
                 }
             }
-            if let Some(journal) = &self.journal {
+            if let Some(journal) = self.journal.as_ref().filter(|_| whole) {
                 journal.done(slot.number)?;
             }
             self.trace.span("commit", start, &[("task", slot.number.to_string())]);
@@ -417,7 +430,8 @@ impl<'a> Session<'a> {
         Ok(self.report())
     }
 
-    fn report(&self) -> Report {
+    /// What was done so far.
+    pub fn report(&self) -> Report {
         let mut report = Report::default();
         self.metrics.fill(&mut report, self.plan.voxels());
         report.bricks.total = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();

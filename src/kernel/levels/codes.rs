@@ -1,7 +1,7 @@
 //! Voxels as codes: how many levels lie below each.
 
 use super::MOST_LEVELS;
-use super::choose::Levels;
+use super::choose::{Levels, PARTS};
 use super::sums::NEVER;
 use crate::grid::Voxel;
 use crate::multiversion;
@@ -29,6 +29,8 @@ pub(crate) struct Table<T> {
     span: [f64; MOST_LEVELS + 1],
     /// Share of an interval that one code of an integer type is; 0 for floats.
     unit: [f64; MOST_LEVELS + 1],
+    /// Share of an interval's voxels up to each part of the way through it.
+    rise: [[f64; PARTS + 1]; MOST_LEVELS + 1],
 }
 
 impl<T: Coded> Table<T> {
@@ -43,6 +45,7 @@ impl<T: Coded> Table<T> {
             base: [0.0; MOST_LEVELS + 1],
             span: [1.0; MOST_LEVELS + 1],
             unit: [0.0; MOST_LEVELS + 1],
+            rise: [[0.0; PARTS + 1]; MOST_LEVELS + 1],
         };
         for k in 0..n {
             table.at[k] = T::from_f64(stored(k));
@@ -50,6 +53,7 @@ impl<T: Coded> Table<T> {
             if !table.step[k] {
                 table.base[k] = stored(k - 1);
                 table.span[k] = stored(k) - stored(k - 1);
+                table.rise[k][1..].copy_from_slice(&levels.rise[k]);
                 table.unit[k] = if T::DTYPE.is_float() { 0.0 } else { 1.0 / table.span[k].abs() };
             }
         }
@@ -65,19 +69,35 @@ impl<T: Coded> Table<T> {
         self.step[code.min(MOST_LEVELS)]
     }
 
-    /// How far `v` lies on the way from the level before its code's to that level; 1 at the level and where there is nothing
-    /// in between.
+    /// How far `v` lies on the way from the level before its code's to that level.
     #[inline(always)]
-    pub fn weight(&self, v: T, code: u8) -> f64 {
+    pub fn way(&self, v: T, code: u8) -> f64 {
         let code = usize::from(code).min(MOST_LEVELS);
-        if self.step[code] { 1.0 } else { (v.to_f64() - self.base[code]) / self.span[code] }
+        (v.to_f64() - self.base[code]) / self.span[code]
     }
 
-    /// The same for the values below `v`, from the weight of `v`.
+    /// Share of the interval's voxels up to there; 1 at the level and where there is nothing in between.
     #[inline(always)]
-    pub fn weight_below(&self, weight: f64, code: u8) -> f64 {
+    pub fn weight(&self, way: f64, code: u8) -> f64 {
         let code = usize::from(code).min(MOST_LEVELS);
-        if self.step[code] { 0.0 } else { (weight - self.unit[code]).max(0.0) }
+        if self.step[code] { 1.0 } else { self.risen(way, code) }
+    }
+
+    /// The same for the values below.
+    #[inline(always)]
+    pub fn weight_below(&self, way: f64, code: u8) -> f64 {
+        let code = usize::from(code).min(MOST_LEVELS);
+        if self.step[code] { 0.0 } else { self.risen(way - self.unit[code], code) }
+    }
+
+    /// Linear in each part; exact at both ends.
+    #[inline(always)]
+    fn risen(&self, way: f64, code: usize) -> f64 {
+        // Not a number, where the span overflowed, is the start.
+        let place = (way * PARTS as f64).max(0.0);
+        let part = (place as usize).min(PARTS - 1);
+        let share = place - part as f64;
+        self.rise[code][part] * (1.0 - share) + self.rise[code][part + 1] * share
     }
 }
 

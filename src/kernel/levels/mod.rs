@@ -1,5 +1,5 @@
 //! Openness from window counts at quantile levels of the whole volume (local histograms smoothed by a box; see Kass and
-//! Solomon 2010), interpolated between levels. Counts are exact integers, levels are the same for every brick.
+//! Solomon 2010), interpolated between levels about as the volume's own distribution rises. Counts are exact integers, levels are the same for every brick.
 
 mod choose;
 mod codes;
@@ -7,7 +7,7 @@ pub mod reference;
 pub(crate) mod sums;
 mod vector;
 
-pub use choose::Levels;
+pub use choose::{Levels, PARTS};
 
 use super::Context;
 use super::simd::Level;
@@ -27,7 +27,7 @@ pub const MOST_LEVELS: usize = 64;
 const TILE: Shape = [128, 96, 128];
 
 /// Writes the openness of the box that starts at voxel `at` of `src`, with F(v) = share of the window's voxels not above
-/// v: exact at levels, linear in v between them. `ties = "mid"`: mean of F(v) and of F below v, which for integers is F(v - 1).
+/// v: exact at levels, and between them rising much as the whole volume's does. `ties = "mid"`: mean of F(v) and of F below v, which for integers is F(v - 1).
 /// A window of equal values gives 1 (0.5), a voxel at +inf 1, at -inf 0, a missing one NaN. `dst` has
 /// `src.dtype().result()`. Panics if extents or types disagree.
 pub fn levels(
@@ -42,7 +42,9 @@ pub fn levels(
     let (from, to) = (src.shape(), dst.shape());
     assert_eq!(dst.dtype(), src.dtype().result(), "type of the openness of {}", src.dtype());
     assert!((0..3).all(|a| at[a] + to[a] <= from[a]), "the output box sticks out of the source");
-    assert!(levels.at.len() <= MOST_LEVELS && levels.step.len() == levels.at.len());
+    assert!(
+        levels.at.len() <= MOST_LEVELS && levels.step.len() == levels.at.len() && levels.rise.len() == levels.at.len()
+    );
     if to.contains(&0) {
         return;
     }
@@ -254,19 +256,20 @@ fn interpolate_inner<T: Coded>(
     counts: &Counts,
     open: &mut [f64],
 ) {
-    let mut weights = [0.0; TILE[2]];
-    let weights = &mut weights[..values.len()];
-    for ((w, v), code) in weights.iter_mut().zip(values).zip(codes) {
-        *w = table.weight(*v, *code);
+    let mut ways = [0.0; TILE[2]];
+    let ways = &mut ways[..values.len()];
+    for ((way, v), code) in ways.iter_mut().zip(values).zip(codes) {
+        *way = table.way(*v, *code);
     }
-    for (x, (open, w)) in open.iter_mut().zip(weights.iter()).enumerate() {
+    for (x, (open, way)) in open.iter_mut().zip(ways.iter()).enumerate() {
+        let w = table.weight(*way, codes[x]);
         let (low, n) = (f64::from(counts.low[x]), f64::from(counts.n[x]));
         // The product is rounded once and the sum once: at w = 1 both are exact.
         let at_most = low + (f64::from(counts.high[x]) - low) * w;
         *open = match ties {
             Ties::Le => at_most / n,
             Ties::Mid => {
-                let below = table.weight_below(*w, codes[x]);
+                let below = table.weight_below(*way, codes[x]);
                 (at_most + (low + (f64::from(counts.high[x]) - low) * below)) / (2.0 * n)
             }
         };

@@ -1,6 +1,6 @@
 //! What the kernel must compute, one voxel at a time, short enough to check by reading. Not fast.
 
-use super::Levels;
+use super::{Levels, PARTS};
 use crate::grid::{View, Voxel};
 use crate::stage::{Ties, WindowParams};
 
@@ -35,7 +35,13 @@ pub fn voxel<T: Voxel>(src: View<T>, c: [usize; 3], levels: &Levels, params: &Wi
         return if ties == Ties::Le { after / n } else { (before + after) / (2.0 * n) };
     }
     let (from, to) = (levels.at[k - 1], levels.at[k]);
-    let slope = |u: f64| (before + (after - before) * ((u - from) / (to - from)).max(0.0)) / n;
+    let rise = |parts: usize| if parts == 0 { 0.0 } else { levels.rise[k][parts - 1] };
+    let slope = |u: f64| {
+        let way = ((u - from) / (to - from)).max(0.0) * PARTS as f64;
+        let parts = (way.floor() as usize).min(PARTS - 1);
+        let risen = rise(parts) + (rise(parts + 1) - rise(parts)) * (way - parts as f64);
+        (before + (after - before) * risen) / n
+    };
     let below = if T::DTYPE.is_float() { v } else { v - 1.0 };
     if ties == Ties::Le { slope(v) } else { (slope(v) + slope(below)) / 2.0 }
 }

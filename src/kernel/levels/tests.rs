@@ -150,7 +150,7 @@ fn an_increasing_map_of_values_that_are_levels_changes_nothing() {
 fn constants_are_decided_exactly() {
     let p = params([2, 2, 2], None, false);
     // Levels that no voxel of the window has.
-    let l = Levels { at: vec![-1000.0, -1.0, 60.0, 1000.0], step: vec![true, false, false, false] };
+    let l = Levels::even(vec![-1000.0, -1.0, 60.0, 1000.0], vec![true, false, false, false]);
     for dtype in DType::ALL {
         let v = constant(dtype, [3, 4, 70], 7.0);
         for (ties, expect) in [(Ties::Le, 1.0), (Ties::Mid, 0.5)] {

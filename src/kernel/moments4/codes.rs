@@ -120,7 +120,7 @@ mod tests {
     use crate::kernel::simd::Level;
 
     fn levels(at: &[f64], heavy: &[f64]) -> Levels {
-        Levels { at: at.to_vec(), step: at.iter().map(|v| heavy.contains(v)).collect() }
+        Levels::even(at.to_vec(), at.iter().map(|v| heavy.contains(v)).collect())
     }
 
     #[test]
