@@ -2,7 +2,8 @@
 //! engine. Boxes are counted from the start of the map's region.
 
 use super::passes::{largest, packed, parts_within};
-use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
+use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::recorder::Recorder;
 use crate::grid::{DType, Region, Shape};
 use crate::kernel::occlusion_map::{full_weights, needed};
 
@@ -126,37 +127,30 @@ impl MapJob {
         let boxes = self.boxes(part);
         let pitch = self.pitch(boxes[0]);
         let source = boxes[0].shape()[0] * boxes[0].shape()[1] * pitch * self.voxel;
-        let mut recording = Recording::default();
+        let mut recorder = Recorder::new(source as u64);
         let mut from = Grid { region: boxes[0], buffer: Buffer::Source, pitch };
         for k in 1..boxes.len() {
             let (fine, halved) = (self.levels[k - 1].shape, self.levels[k].halved);
             let want = needed(boxes[k], halved, fine);
             for axis in (0..3).filter(|&a| halved[a]) {
-                from = self.pass(&mut recording, &from, want, boxes[k], axis, fine[axis]);
+                let next = self.pass(&mut recorder, &from, want, boxes[k], axis, fine[axis]);
+                recorder.give(from.buffer);
+                from = next;
             }
-            let place = self.place(&boxes, k);
-            let (bytes, to) = (place.len() as u64, place.start as u64);
-            recording.commands.push(Command::Readback(Readback { from: from.buffer, bytes, to }));
-            recording.sizes.read = rounded(place.end as u64);
+            recorder.read(from.buffer.into(), self.place(&boxes, k).len() as u64);
         }
-        let dispatches = recording.dispatches().count() as u64;
-        recording.sizes.params = dispatches * PARAMS_STRIDE;
-        recording.sizes.tables = rounded(recording.tables.len() as u64 * 4);
-        recording.sizes.source = rounded(source as u64);
-        recording
+        recorder.finish().expect("a map takes few buffers")
     }
 
     /// Halves one axis of the `n` cells of a level; of the axes that are not done yet, only what is wanted goes on.
-    fn pass(&self, to: &mut Recording, from: &Grid, want: Region, coarse: Region, axis: usize, n: usize) -> Grid {
+    fn pass(&self, to: &mut Recorder, from: &Grid, want: Region, coarse: Region, axis: usize, n: usize) -> Grid {
         // Axes up to this one are in coarse cells, or are not halved, and then both boxes say the same of them.
         let lo: [i64; 3] = std::array::from_fn(|a| if a <= axis { coarse.lo[a] } else { want.lo[a] });
         let hi = std::array::from_fn(|a| if a <= axis { coarse.hi[a] } else { want.hi[a] });
         let region = Region::new(lo, hi);
         let start = from.region.lo[axis];
-        let weights = to.tables.len() as u32;
-        for i in coarse.lo[axis]..coarse.hi[axis] {
-            to.tables.extend(full_weights(i, n as i64).map(|w| (w as f32).to_bits()));
-        }
+        let cells = coarse.lo[axis]..coarse.hi[axis];
+        let weights = to.table(cells.flat_map(|i| full_weights(i, n as i64)).map(|w| (w as f32).to_bits()));
         let shift = |a: usize| if a == axis { 0 } else { (lo[a] - from.region.lo[a]) as u32 };
         let pool = Pool {
             out: region.shape().map(|n| n as u32),
@@ -173,17 +167,9 @@ impl MapJob {
             threads: region.voxels() as u32,
             ..Pool::default()
         };
-        let buffer = if from.buffer == Buffer::A { Buffer::B } else { Buffer::A };
-        let bytes = rounded((region.voxels() * 4 * CELL) as u64);
-        let held = if buffer == Buffer::A { &mut to.sizes.a } else { &mut to.sizes.b };
-        *held = bytes.max(*held);
-        to.commands.push(Command::Dispatch(Dispatch {
-            shader: Shader::MapPool,
-            entry: (from.buffer != Buffer::Source) as usize,
-            params: bytemuck::bytes_of(&pool).to_vec(),
-            bind: vec![from.buffer, buffer, Buffer::Tables],
-            threads: pool.threads,
-        }));
+        let buffer = to.take((region.voxels() * 4 * CELL) as u64);
+        let bind = [from.buffer, buffer, Buffer::Tables].map(Bind::from);
+        to.dispatch(Shader::MapPool, (from.buffer != Buffer::Source) as usize, &pool, &bind, pool.threads);
         Grid { region, buffer, pitch: region.shape()[2] }
     }
 }

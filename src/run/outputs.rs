@@ -135,25 +135,7 @@ pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], r
         let shape = output.level(deepest).expect("level exists").shape;
         Spill::open(&dir.join(format!("cells.{deepest}")), shape, per_cell, size_of::<f64>())
     });
-    Ok(Target { sink, levels, cells: cells.transpose()?, range: range_of(output, globals) })
-}
-
-/// The values that map to 0 and the largest code, from the config or a pre-pass.
-pub fn range_of(output: &OutputPlan, globals: &[Vec<f64>]) -> Option<[f64; 2]> {
-    match output.auto_range {
-        Some(id) => {
-            let [lo, hi] = Plan::global(globals, id);
-            let usable = lo.is_finite() && hi.is_finite();
-            Some(if !usable {
-                [0.0, 1.0]
-            } else if hi > lo {
-                [lo, hi]
-            } else {
-                [lo, lo + 1.0]
-            })
-        }
-        None => output.range,
-    }
+    Ok(Target { sink, levels, cells: cells.transpose()?, range: output.mapped(globals) })
 }
 
 /// Commits what a finished task left in one output.
