@@ -6,6 +6,8 @@ const GREATEST: u32 = 2u;
 const FIRST: u32 = 3u;
 const MOMENTS: u32 = 4u;
 const SPREAD: u32 = 5u; // moments of a channel that is a standard deviation
+const MAP_MEAN: u32 = 6u; // of an occlusion map's cells (map_pool.wgsl)
+const MAP_VARIANCE: u32 = 7u;
 
 // Unrounded: a sum (of means) or one of the values, voxels that entered, and of moments the sum of the voxels' variances and
 // the sum of squared deviations of their means.
@@ -17,7 +19,7 @@ struct Cell {
 }
 
 fn words_of(kind: u32) -> u32 {
-    return select(3u, 7u, kind >= MOMENTS);
+    return select(3u, 7u, kind == MOMENTS || kind == SPREAD);
 }
 
 fn pair_at(at: u32) -> vec2<u32> {

@@ -1,7 +1,7 @@
 // Voxels, or cells of a level, to the type of an output, rounded once. One thread makes one word: one f32, two codes of 16
 // bits or four of 8.
 //
-// Agrees bit for bit with src/kernel/convert and src/kernel/reduce (values): the same formulas in f64 (double.wgsl).
+// Agrees bit for bit with src/kernel/convert and src/kernel/reduce (values), and src/gpu/occlusion.rs: the same formulas in f64 (double.wgsl).
 // Parameters: src/gpu/levels.rs, struct Write.
 // Bindings, group 0: 0 uniform Write; 1 storage, read: bits of f32 voxels (`first`) or cells (`next`); 2 storage, written:
 // codes, dense, the first in the low bits. Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no
@@ -26,14 +26,25 @@ struct Write {
     top: vec2<u32>,
     low: vec2<u32>,
     high: vec2<u32>,
+    slope: vec2<u32>, // of an occlusion map's values, which are not scaled yet
+    intercept: vec2<u32>,
 }
 
 @group(0) @binding(0) var<uniform> p: Write;
 @group(0) @binding(1) var<storage, read> input: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 
-fn voxel(i: u32) -> u32 {
-    return input[p.start + (i / (p.nx * p.ny)) * p.plane + ((i / p.nx) % p.ny) * p.row + i % p.nx];
+fn place(i: u32) -> u32 {
+    return p.start + (i / (p.nx * p.ny)) * p.plane + ((i / p.nx) % p.ny) * p.row + i % p.nx;
+}
+
+// An occlusion map's mean, a pair of f32, or variance, scaled.
+fn mapped(at: u32) -> vec2<u32> {
+    var v = widened(input[3u * at + 2u]);
+    if p.kind == MAP_MEAN {
+        v = sum_of(widened(input[3u * at]), widened(input[3u * at + 1u]));
+    }
+    return sum_of(product_of(p.slope, v), p.intercept);
 }
 
 fn value(cell: Cell) -> vec2<u32> {
@@ -90,7 +101,7 @@ fn code(v: vec2<u32>) -> u32 {
 
 fn one(thread: u32, voxels: bool) {
     if p.real == 1u && voxels {
-        output[thread] = voxel(thread);
+        output[thread] = input[place(thread)];
         return;
     }
     let many = 1u << p.packing;
@@ -103,9 +114,11 @@ fn one(thread: u32, voxels: bool) {
         }
         var v = vec2<u32>();
         if voxels {
-            v = widened(voxel(i));
+            v = widened(input[place(i)]);
+        } else if p.kind >= MAP_MEAN {
+            v = mapped(place(i));
         } else {
-            v = value(cell_from(i, p.kind));
+            v = value(cell_from(place(i), p.kind));
         }
         if p.real == 1u {
             word = select(narrowed(v), 0x7fc00000u, is_nan64(v));

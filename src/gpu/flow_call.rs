@@ -102,7 +102,7 @@ fn take(flow: &Flow, part: &FlowPart, bytes: &[u8], outs: &mut [SinkOut]) -> Res
 }
 
 /// Rows of a box, densely packed, to their places.
-fn paste(bytes: &[u8], [nz, ny, nx]: Shape, at: [usize; 3], dst: &mut AnyViewMut) {
+pub(super) fn paste(bytes: &[u8], [nz, ny, nx]: Shape, at: [usize; 3], dst: &mut AnyViewMut) {
     let size = dst.dtype().size();
     crate::with_view!(AnyViewMut, dst, d => {
         for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {

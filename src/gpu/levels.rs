@@ -3,7 +3,7 @@
 
 use super::record::{Bind, Buffer, Shader};
 use super::recorder::Recorder;
-use crate::grid::{DType, Region, Shape};
+use crate::grid::{Affine, DType, Region, Shape};
 use crate::kernel::convert::{Linear, Mapping};
 use crate::stage::Reduce;
 
@@ -52,8 +52,8 @@ pub struct Write {
     pub fill: u32,
     pub threads: u32,
     pub real: u32,
-    /// half, lo, width, top, low, high.
-    pub numbers: [[u32; 2]; 6],
+    /// half, lo, width, top, low, high, slope, intercept.
+    pub numbers: [[u32; 2]; 8],
 }
 
 /// The words of an f64, the low one first.
@@ -129,7 +129,7 @@ impl Pyramid {
         let whole = value.region == *region && value.pitch == shape[2] && self.dtype == DType::F32;
         let place = match whole {
             true => to.read(value.bind, shape.iter().product::<usize>() as u64 * 4),
-            false => self.write(value.bind, value.start(region), shape, false, to),
+            false => self.codes().write(value.bind, value.start(region), shape, false, to),
         };
         placed.levels.push((place, shape));
         let (mut fine, mut extent) = (None, shape);
@@ -151,7 +151,7 @@ impl Pyramid {
             let bind = [input, cells.into(), mean.map_or(input, |m| m.bind)];
             to.dispatch(Shader::LevelPool, fine.is_some() as usize, &join, &bind, join.threads);
             fine.into_iter().for_each(|f: Buffer| to.give(f));
-            placed.levels.push((self.write(cells.into(), [0; 3], next, true, to), next));
+            placed.levels.push((self.codes().write(cells.into(), dense(next), next, true, to), next));
             (fine, extent) = (Some(cells), next);
         }
         if let Some(cells) = fine {
@@ -162,23 +162,48 @@ impl Pyramid {
         placed
     }
 
+    fn codes(&self) -> Codes {
+        Codes { dtype: self.dtype, mapping: self.mapping, kind: self.kind(), affine: Affine::IDENTITY }
+    }
+}
+
+/// Where cells of a box that are dense stand: the first, and the strides of planes and rows.
+fn dense([_, ny, nx]: Shape) -> [u32; 3] {
+    [0, ny * nx, nx].map(|n| n as u32)
+}
+
+/// How voxels or cells become an output's type.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Codes {
+    pub dtype: DType,
+    pub mapping: Mapping,
+    /// What cells hold.
+    pub kind: u32,
+    /// Of an occlusion map's values.
+    pub affine: Affine,
+}
+
+/// Kinds of an occlusion map's cells: of which the mean is written, or the variance.
+pub(super) const MAP_KINDS: [u32; 2] = [6, 7];
+
+impl Codes {
     /// Rounds a box and brings it back; says where.
-    fn write(&self, from: Bind, start: [u32; 3], extent: Shape, cells: bool, to: &mut Recorder) -> u64 {
+    pub fn write(&self, from: Bind, start: [u32; 3], extent: Shape, cells: bool, to: &mut Recorder) -> u64 {
         let (size, count) = (self.dtype.size(), extent.iter().product::<usize>());
-        let linear = Linear::new(self.mapping, self.dtype);
-        let Linear { half, lo, width, top, low, high, fill } = linear;
+        let Linear { half, lo, width, top, low, high, fill } = Linear::new(self.mapping, self.dtype);
+        let Affine { slope, intercept } = self.affine;
         let threads = (count * size).div_ceil(4) as u32;
         let write = Write {
             extent: [extent[1] as u32, extent[2] as u32],
             count: count as u32,
             start,
-            kind: self.kind(),
+            kind: self.kind,
             packing: [0, 2, 1, 0, 0][size],
             linear: self.mapping.range.is_some() as u32,
             fill: fill.round_ties_even() as i64 as u32,
             threads,
             real: (self.dtype == DType::F32) as u32,
-            numbers: [half, lo, width, top, low, high].map(words),
+            numbers: [half, lo, width, top, low, high, slope, intercept].map(words),
         };
         let codes = to.take(threads as u64 * 4);
         to.dispatch(Shader::LevelWrite, cells as usize, &write, &[from, codes.into()], threads);

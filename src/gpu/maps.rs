@@ -1,10 +1,12 @@
 //! Occlusion maps: the chain of levels of a brick recorded, cut into parts that fit. Pure arithmetic, shared by planner and
 //! engine. Boxes are counted from the start of the map's region.
 
+use super::levels::{Codes, MAP_KINDS, Slab};
 use super::passes::{largest, packed, parts_within};
 use super::record::{Bind, Buffer, Recording, Shader, Sizes};
 use super::recorder::Recorder;
-use crate::grid::{DType, Region, Shape};
+use crate::grid::{Affine, DType, Region, Shape};
+use crate::kernel::convert::Mapping;
 use crate::kernel::occlusion_map::{full_weights, needed};
 
 /// What one dispatch does; `struct Pool` of `shaders/map_pool.wgsl`, which explains the fields.
@@ -48,6 +50,28 @@ pub struct MapJob {
 
 /// Words of a cell.
 pub const CELL: usize = 3;
+
+/// What an output takes of a map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapCodes {
+    /// The first level that is stored.
+    pub first: usize,
+    /// By component: 0 for the mean, 1 for the variance.
+    pub moments: Vec<usize>,
+    pub dtype: DType,
+    pub mapping: Mapping,
+    pub affine: Affine,
+    /// The cells of the last level are kept.
+    pub cells: bool,
+}
+
+impl MapCodes {
+    fn of(&self, moment: usize) -> Codes {
+        let squared = Affine { slope: self.affine.slope * self.affine.slope, intercept: 0.0 };
+        let affine = [self.affine, squared][moment];
+        Codes { dtype: self.dtype, mapping: self.mapping, kind: MAP_KINDS[moment], affine }
+    }
+}
 
 impl MapJob {
     /// `levels` up to the last that bricks make. `None` if voxels of this type have no kernel here, or no level is made.
@@ -114,7 +138,10 @@ impl MapJob {
     }
 
     fn sizes(&self, part: Region) -> Sizes {
-        self.record(part).sizes
+        // With the most that an output takes.
+        let (dtype, mapping, affine) = (DType::F32, Mapping::KEEP, Affine::IDENTITY);
+        let codes = MapCodes { first: 0, moments: vec![0, 1], dtype, mapping, affine, cells: true };
+        self.record(part).sizes.max(self.recorded(part, Some(&codes)).0.sizes)
     }
 
     /// Largest buffers of any part.
@@ -122,12 +149,19 @@ impl MapJob {
         largest(self.parts(brick, cap), |p| self.sizes(*p))
     }
 
-    /// Every level of a part, axis by axis, each read back when it is made.
+    /// Every level of a part, axis by axis, each read back when it is made: its cells, or with `codes` those that the part
+    /// owns in an output's type, one component after the other, and the cells of the last one.
     pub fn record(&self, part: Region) -> Recording {
+        self.recorded(part, None).0
+    }
+
+    /// As [`Self::record`], and where the codes of every level from 1 on and the last one's cells stand.
+    pub(super) fn recorded(&self, part: Region, codes: Option<&MapCodes>) -> (Recording, Vec<Vec<u64>>, u64) {
         let boxes = self.boxes(part);
         let pitch = self.pitch(boxes[0]);
         let source = boxes[0].shape()[0] * boxes[0].shape()[1] * pitch * self.voxel;
         let mut recorder = Recorder::new(source as u64);
+        let (mut places, mut last) = (Vec::new(), 0);
         let mut from = Grid { region: boxes[0], buffer: Buffer::Source, pitch };
         for k in 1..boxes.len() {
             let (fine, halved) = (self.levels[k - 1].shape, self.levels[k].halved);
@@ -137,9 +171,17 @@ impl MapJob {
                 recorder.give(from.buffer);
                 from = next;
             }
-            recorder.read(from.buffer.into(), self.place(&boxes, k).len() as u64);
+            let own = self.own(k, part);
+            let stored: Option<Vec<Codes>> =
+                codes.map(|c| c.moments.iter().filter(|_| k >= c.first).map(|m| c.of(*m)).collect());
+            let slab = Slab { bind: from.buffer.into(), region: boxes[k], pitch: boxes[k].shape()[2] };
+            let one = |c: Codes| c.write(slab.bind, slab.start(&own), own.shape(), true, &mut recorder);
+            places.push(stored.unwrap_or_default().into_iter().map(one).collect());
+            if codes.is_none_or(|c| c.cells && k + 1 == boxes.len()) {
+                last = recorder.read(from.buffer.into(), self.place(&boxes, k).len() as u64);
+            }
         }
-        recorder.finish().expect("a map takes few buffers")
+        (recorder.finish().expect("a map takes few buffers"), places, last)
     }
 
     /// Halves one axis of the `n` cells of a level; of the axes that are not done yet, only what is wanted goes on.

@@ -48,6 +48,7 @@ mod windows;
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind};
 pub use flow_call::SinkOut;
+pub use occlusion::MapLevels;
 
 use crate::config::Device;
 

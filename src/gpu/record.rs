@@ -11,7 +11,7 @@ pub const STAMP_BYTES: u64 = 256;
 pub const GROUP: u32 = 64;
 
 /// Buffers that a recording may work in at once.
-pub const WORK: usize = 16;
+pub const WORK: usize = 32;
 
 /// Device buffers of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -245,7 +245,7 @@ impl Assembler<'_> {
     }
 
     /// Hands voxels of the output's type to their chunks: whole ones are encoded at once, parts wait for the rest.
-    fn put(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+    pub fn put(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
         let (output, sink) = (place.output, &place.target.sink);
         let dataset = k - output.first_level();
         let mut push = |region: Region, chunk: Encoded| {
