@@ -13,17 +13,23 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use occlude::brick::{Scratch, Voxels};
-use occlude::gpu::chain::Extents;
 use occlude::gpu::facts::{SLOTS, tolerance};
+use occlude::gpu::flow::{Flow, FlowStep, Input, Kernel as Step, Sink};
+use occlude::gpu::levels::Pyramid;
 use occlude::gpu::slopes::Fit;
-use occlude::gpu::{Gpu, GpuError, GpuKind, Times};
+use occlude::gpu::taps::Wanted;
+use occlude::gpu::{Gpu, GpuError, GpuKind, SinkOut, Times};
 use occlude::grid::{Affine, AnyView, AnyViewMut, DType, Region, Shape, ViewMut};
+use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::gradient::{GradientOut, gradient};
 use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
+use occlude::kernel::reduce::{Cells, Level0};
 use occlude::kernel::simd::Level;
 use occlude::kernel::window::{Place, WindowOut, window};
 use occlude::kernel::{Context, gaussian};
-use occlude::stage::{DirectionSet, DirectionWeights, GradientWeight, Method, Rho, Ties, WindowChannel, WindowParams};
+use occlude::stage::{
+    DirectionSet, DirectionWeights, GradientWeight, Method, Reduce, Rho, Ties, WindowChannel, WindowParams,
+};
 
 const ROUNDS: usize = 3;
 
@@ -36,6 +42,8 @@ enum Kernel {
     Gradient(usize),
     /// Magnitude of 5^3 voxels of a Gaussian mean, which stays on the device.
     Smoothed(f64),
+    /// A channel of windows in codes of u8 with three levels, made there: neither sums nor floats come back.
+    Levels(WindowChannel, usize),
     /// Directions, distance.
     Obscurance(Prepared),
 }
@@ -78,6 +86,10 @@ fn cases() -> Vec<Case> {
             list.push(Case { name: format!("{name} r={radius}"), kernel });
         }
     }
+    let open = WindowChannel::Openness(Method::CdfPower, Ties::Le);
+    for (name, channel) in [("mean", WindowChannel::Mean), ("cdf_power", open)] {
+        list.push(Case { name: format!("{name} r=10, levels"), kernel: Kernel::Levels(channel, 10) });
+    }
     for sigma in [2.0, 6.0] {
         list.push(Case { name: format!("gaussian s={sigma}"), kernel: Kernel::Gaussian(sigma, false) });
         list.push(Case { name: format!("gaussian+variance s={sigma}"), kernel: Kernel::Gaussian(sigma, true) });
@@ -115,6 +127,9 @@ impl Case {
             Kernel::Window(..) if dtype == DType::F32 => tolerance::VARIANCE,
             Kernel::Gaussian(_, true) => tolerance::VARIANCE,
             Kernel::Gradient(_) | Kernel::Smoothed(_) => 2.0 * tolerance::GRADIENT,
+            Kernel::Window(ref c, _) if c.iter().any(is_open) => tolerance::OPENNESS / 65536.0,
+            // A code may round to its neighbour.
+            Kernel::Levels(c, _) if is_open(&c) || dtype == DType::F32 => 1.0 / 65536.0,
             _ => 0.0,
         }
     }
@@ -136,6 +151,11 @@ impl Case {
         let types = match &self.kernel {
             Kernel::Window(channels, _) => channels.iter().map(of).collect(),
             Kernel::Gaussian(_, true) => vec![DType::F32; 2],
+            Kernel::Levels(..) => {
+                let pyramid = pyramid();
+                let extents = (0..=LEVELS).map(|k| pyramid.extent(k, shape).iter().product());
+                return extents.map(|n| Voxels::zeroed(DType::U8, n)).collect();
+            }
             _ => vec![DType::F32],
         };
         types.into_iter().map(|t| Voxels::zeroed(t, self.extent(shape).iter().product())).collect()
@@ -186,10 +206,13 @@ impl Case {
                 let magnitude = out[0].view_mut(dst);
                 match gpu {
                     Some(gpu) => {
-                        let extents = Extents { src: shape, middle: shape, at: [0; 3], dst, inner: [2; 3] };
-                        let out = GradientOut { magnitude: Some(magnitude), vector: None };
-                        let done = gpu.smoothed_gradient(src, &extents, sigma, &fit(5), out);
-                        done.map(|t| t.expect("means of noise lie within f32"))
+                        let reach = sigma.map(|s| (3.0 * s).ceil() as usize);
+                        let first = Step::Gaussian { sigma, wanted: Wanted { mean: true, variance: false } };
+                        let second = Step::Gradient { fit: fit(5), magnitude: true, vector: false };
+                        let steps =
+                            [(first, Input::Source, reach), (second, Input::Made { step: 0, channel: 0 }, [2; 3])];
+                        let region = Region::new([2; 3], shape.map(|n| n as i64 - 2));
+                        flow_on(gpu, &flow(src.dtype(), shape, &steps, region, None), src, SinkOut::Voxels(magnitude))
                     }
                     None => {
                         let mut means = Voxels::zeroed(DType::F32, shape.iter().product());
@@ -199,6 +222,7 @@ impl Case {
                     }
                 }
             }
+            Kernel::Levels(channel, radius) => levels_on(gpu, *channel, *radius, src, out, &mut cx),
             Kernel::Obscurance(sweep) => {
                 let whole = Region::whole(shape);
                 let AnyViewMut::F32(view) = out[0].view_mut(shape) else { unreachable!("openness is f32") };
@@ -207,6 +231,93 @@ impl Case {
         };
         (start.elapsed().as_secs_f64(), times.expect("the device works"))
     }
+}
+
+fn is_open(channel: &WindowChannel) -> bool {
+    matches!(channel, WindowChannel::Openness(..))
+}
+
+/// Levels beyond the first.
+const LEVELS: usize = 3;
+
+fn pyramid() -> Pyramid {
+    let mapping = Mapping { range: Some([0.0, 65535.0]), fill: 0.0 };
+    Pyramid {
+        dtype: DType::U8,
+        mapping,
+        reduce: Reduce::Mean,
+        std: false,
+        halved: vec![[true; 3]; LEVELS],
+        cells: true,
+    }
+}
+
+/// Steps, each with what it reads and how far, and what comes back of the last.
+fn flow(
+    dtype: DType,
+    shape: Shape,
+    steps: &[(Step, Input, [usize; 3])],
+    region: Region,
+    pyramid: Option<Pyramid>,
+) -> Flow {
+    let value = Input::Made { step: steps.len() - 1, channel: 0 };
+    let step = |(kernel, input, reach): &(Step, Input, [usize; 3])| FlowStep {
+        kernel: kernel.clone(),
+        inputs: vec![*input],
+        reach: *reach,
+        padded: false,
+    };
+    Flow {
+        dtype,
+        affine: Affine::IDENTITY,
+        volume: Region::whole(shape),
+        steps: steps.iter().map(step).collect(),
+        sinks: vec![Sink { value, mean: None, region, pyramid }],
+    }
+}
+
+fn flow_on(gpu: &Gpu, flow: &Flow, src: AnyView, out: SinkOut) -> Result<Times, GpuError> {
+    let done = gpu.flow(flow, src, flow.volume, &mut [out]);
+    done.map(|t| t.expect("noise lies within f32"))
+}
+
+fn levels_on(
+    gpu: Option<&Gpu>,
+    channel: WindowChannel,
+    radius: usize,
+    src: AnyView,
+    out: &mut [Voxels],
+    cx: &mut Context,
+) -> Result<Times, GpuError> {
+    let (shape, radius) = (src.shape(), [radius; 3]);
+    let mut pyramid = pyramid();
+    if is_open(&channel) {
+        pyramid.mapping.range = Some([0.0, 1.0]);
+    }
+    let params = WindowParams { radius, affine: Affine::IDENTITY, missing: None, solid_low: false };
+    if let Some(gpu) = gpu {
+        let steps = [(Step::Windows { params, channels: vec![channel] }, Input::Source, radius)];
+        let views = out.iter_mut().enumerate().map(|(k, v)| v.view_mut(pyramid.extent(k, shape)));
+        let (views, mut cells) = (views.collect(), Vec::new());
+        let flow = flow(src.dtype(), shape, &steps, Region::whole(shape), Some(pyramid));
+        return flow_on(gpu, &flow, src, SinkOut::Levels(views, &mut cells));
+    }
+    let mut made = Voxels::zeroed(DType::F32, shape.iter().product());
+    let mut outs = [WindowOut { channel, dst: made.view_mut(shape) }];
+    window(src, &params, Place::whole([0; 3]), &mut outs, cx);
+    convert(made.view(shape), pyramid.mapping, out[0].view_mut(shape));
+    let (mut cells, mut fine) = (Cells::default(), Cells::default());
+    for (k, halved) in pyramid.halved.iter().enumerate() {
+        if k == 0 {
+            let src = Level0 { value: made.view(shape), mean: None, needed: None };
+            cells.first(pyramid.reduce, false, src, *halved, cx);
+        } else {
+            std::mem::swap(&mut cells, &mut fine);
+            cells.next_from(&fine, *halved, cx);
+        }
+        cells.write([0; 3], pyramid.mapping, out[k + 1].view_mut(cells.shape), cx);
+    }
+    Ok(Times::default())
 }
 
 fn fit(size: usize) -> Fit {
@@ -363,10 +474,9 @@ fn main() {
         "kernel", "type", "1 thread", "ring", "pack", "finish", "device"
     );
     let volume = noise(DType::U8, shape);
-    for case in cases()
-        .iter()
-        .filter(|c| ["cdf_power r=10", "gradient of s=2", "obscurance 42 d=64"].contains(&c.name.as_str()))
-    {
+    for case in cases().iter().filter(|c| {
+        ["cdf_power r=10", "cdf_power r=10, levels", "gradient of s=2", "obscurance 42 d=64"].contains(&c.name.as_str())
+    }) {
         stream(&gpu, case, &volume, shape);
     }
 }

@@ -30,6 +30,10 @@ struct Slopes {
     vector: u32,    // 1: components, 0: magnitude
     threads: u32,
     table: u32,     // where the weights start
+    stride: u32,    // from plane to plane of the results
+    spare_0: u32,
+    spare_1: u32,
+    spare_2: u32,
 }
 
 @group(0) @binding(0) var<uniform> p: Slopes;
@@ -132,10 +136,9 @@ fn slopes(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
     let small = p.real == 1u && most != 0u && most < SMALL;
     let marked = most >= LARGE || small;
     if p.vector == 1u {
-        let plane = p.out_z * p.out_y * p.out_x;
         output[thread] = select(bitcast<u32>(g.x), MARKED, marked);
-        output[plane + thread] = select(bitcast<u32>(g.y), MARKED, marked);
-        output[2u * plane + thread] = select(bitcast<u32>(g.z), MARKED, marked);
+        output[p.stride + thread] = select(bitcast<u32>(g.y), MARKED, marked);
+        output[2u * p.stride + thread] = select(bitcast<u32>(g.z), MARKED, marked);
     } else {
         output[thread] = select(bitcast<u32>(length_of(g)), MARKED, marked);
     }

@@ -1,6 +1,5 @@
 // From moments of windows of f32 to results: means, extremes, spreads and estimators of openness, one plane per channel. One
-// thread makes all channels of one voxel. Roots and quotients may be off by a few bits; logarithm and exponential are
-// polynomials of our own.
+// thread makes all channels of one voxel.
 //
 // Agrees within facts::tolerance with src/kernel/window/float_estimate.rs; a window with an infinity, or whose numbers lie at
 // the ends of f32, gets MARKED in every channel, and is left to the CPU. Parameters: src/gpu/finish.rs, struct Finish.
@@ -20,7 +19,7 @@ struct Finish {
     count: u32,     // channels
     zero: u32,      // 0, which no compiler knows
     threads: u32,
-    spare: u32,
+    stride: u32,    // from plane to plane of the results
     channels: array<vec4<u32>, 4>, // what each is, and 256 where constant windows are half open
 }
 
@@ -28,7 +27,7 @@ struct Finish {
 @group(0) @binding(1) var<storage, read> voxels: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> order: array<vec2<u32>>;
-@group(0) @binding(4) var<storage, read_write> cells: array<u32>;
+@group(0) @binding(4) var<storage, read> cells: array<u32>;
 
 const MARKED: u32 = 0xffffffffu;
 const MISSING: u32 = 0x7fc00000u;
@@ -44,71 +43,6 @@ fn number(code: u32) -> f32 {
     return bitcast<f32>(select(bits, 0u, bits == 0x80000000u));
 }
 
-// Twice the inverse hyperbolic tangent of |s| <= 1/3.
-fn twice_atanh(s: f32) -> f32 {
-    let q = s * s;
-    var sum = 1.0 / 17.0;
-    sum = sum * q + 1.0 / 15.0;
-    sum = sum * q + 1.0 / 13.0;
-    sum = sum * q + 1.0 / 11.0;
-    sum = sum * q + 1.0 / 9.0;
-    sum = sum * q + 1.0 / 7.0;
-    sum = sum * q + 1.0 / 5.0;
-    sum = sum * q + 1.0 / 3.0;
-    return 2.0 * s + 2.0 * s * (q * sum);
-}
-
-// Natural logarithm of a positive normal number.
-fn ln(v: f32) -> f32 {
-    let bits = bitcast<u32>(v) - 0x3f3504f3u;
-    let exponent = bitcast<i32>(bits) >> 23u;
-    let m = bitcast<f32>((bits & 0x007fffffu) + 0x3f3504f3u);
-    return f32(exponent) * 0.6931472 + twice_atanh((m - 1.0) / (m + 1.0));
-}
-
-// Natural logarithm of 1 - u, 0 <= u <= 1/2.
-fn ln_less(u: f32) -> f32 {
-    return twice_atanh(-u / (2.0 - u));
-}
-
-// e^v of a number that is not positive.
-fn exp_of(v: f32) -> f32 {
-    if v < -87.0 {
-        return 0.0;
-    }
-    let k = floor(v * 1.442695 + 0.5);
-    // The first has so few bits that its product is exact.
-    let r = (v - k * 0.693359375) + k * 2.1219444e-4;
-    var sum = 1.0 / 720.0;
-    sum = sum * r + 1.0 / 120.0;
-    sum = sum * r + 1.0 / 24.0;
-    sum = sum * r + 1.0 / 6.0;
-    sum = sum * r + 0.5;
-    sum = (sum * r + 1.0) * r + 1.0;
-    return sum * bitcast<f32>(u32(i32(k) + 127) << 23u);
-}
-
-// Half of the complementary error function of x >= 0, relative error 1.2e-7 (Numerical Recipes, Chebyshev fit).
-fn half_erfc(x: f32) -> f32 {
-    let t = 1.0 / (1.0 + 0.5 * x);
-    var sum = 0.17087277;
-    sum = sum * t - 0.82215223;
-    sum = sum * t + 1.48851587;
-    sum = sum * t - 1.13520398;
-    sum = sum * t + 0.27886807;
-    sum = sum * t - 0.18628806;
-    sum = sum * t + 0.09678418;
-    sum = sum * t + 0.37409196;
-    sum = sum * t + 1.00002368;
-    return 0.5 * t * exp_of(min(-x * x - 1.26551223 + t * sum, 0.0));
-}
-
-// Standard normal distribution function.
-fn phi(z: f32) -> f32 {
-    let tail = half_erfc(min(abs(z), 14.0) * 0.70710678);
-    return select(tail, 1.0 - tail, z > 0.0);
-}
-
 // What a window gives.
 struct Window {
     v: f32,
@@ -118,38 +52,15 @@ struct Window {
     variance: f32,
 }
 
-// t^beta; `below` and `above` are the distances to the extremes, in the order of density.
-fn cdf_power(w: Window, below: f32, above: f32) -> f32 {
-    if below == 0.0 {
-        return 0.0;
-    }
-    if above == 0.0 {
-        return 1.0;
-    }
-    let over = distance(w.mean, vec2<f32>(w.lo, 0.0));
-    let under = distance(vec2<f32>(w.hi, 0.0), w.mean);
-    let beta = clamp(select(over / under, under / over, p.flipped == 1u), 1e-6, 1e6);
-    let range = w.hi - w.lo;
-    if 2.0 * above < range {
-        return exp_of(beta * ln_less(above / range));
-    }
-    return exp_of(beta * min(ln(below / range), 0.0));
-}
-
 fn openness(w: Window, kind: u32, below: f32, above: f32) -> f32 {
     if kind == 6u {
-        return cdf_power(w, below, above);
+        let over = distance(w.mean, vec2<f32>(w.lo, 0.0));
+        let under = distance(vec2<f32>(w.hi, 0.0), w.mean);
+        let turned = p.flipped == 1u;
+        return power(below, above, w.hi - w.lo, select(over, under, turned), select(under, over, turned));
     }
     let away = distance(vec2<f32>(w.v, 0.0), w.mean);
-    let z = select(away, -away, p.flipped == 1u) / sqrt(w.variance);
-    if kind == 7u {
-        return phi(z);
-    }
-    let least = 1.0 / (1.0 + z * z);
-    if kind == 8u {
-        return select(0.0, 1.0 - least, z > 0.0);
-    }
-    return select(1.0, least, z > 0.0);
+    return by_spread(kind, select(away, -away, p.flipped == 1u) / sqrt(w.variance));
 }
 
 // Whether f32 cannot hold what a window needs.
@@ -223,7 +134,6 @@ fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
         }
     }
     let marked = p.cell > 0u && !missing && is_left(w);
-    let plane = p.out_z * p.out_y * p.out_x;
     for (var c = 0u; c < p.count; c += 1u) {
         var made = MISSING;
         if marked {
@@ -231,6 +141,6 @@ fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
         } else if !missing {
             made = bitcast<u32>(result(w, p.channels[c / 4u][c % 4u]));
         }
-        output[c * plane + thread] = made;
+        output[c * p.stride + thread] = made;
     }
 }

@@ -36,6 +36,12 @@ fn every_shader_is_valid() {
         if storage != shader.bindings() {
             failures += &format!("{name}: {storage} storage bindings\n");
         }
+        for k in 1..=shader.bindings() {
+            let access = if shader.writes(k) { "read_write" } else { "read" };
+            if !shader.text().contains(&format!("@binding({k}) var<storage, {access}>")) {
+                failures += &format!("{name}: binding {k} is not for {access}\n");
+            }
+        }
         for word in ["Bindings", "Workgroup", "Agrees"] {
             if !shader.text().contains(word) {
                 failures += &format!("{name}: the head does not state: {word}\n");

@@ -1,17 +1,17 @@
 //! Finds an adapter and opens it: Vulkan only, ranked by device type, software refused unless asked for by name.
 
-use std::sync::{Arc, Condvar, Mutex};
+use std::sync::{Arc, Condvar, Mutex, OnceLock};
 
 use super::facts::{GpuFacts, GpuKind, SLOTS};
-use super::record::Shader;
+use super::shaders::{MOST_BINDINGS, Shader};
 use super::slot::Slot;
 
 /// An open device with its pipelines and slots. Dropped and opened anew after a failure.
 pub struct Device {
     pub device: wgpu::Device,
     pub queue: wgpu::Queue,
-    /// By shader, in the order of [`Shader::ALL`].
-    kernels: Vec<Kernel>,
+    /// By shader, in the order of [`Shader::ALL`], and entry point; made when they are first used.
+    kernels: Vec<[OnceLock<Kernel>; 2]>,
     /// Nanoseconds of a tick of the time stamps, where they were asked for and there are any.
     pub tick: Option<f64>,
     slots: Mutex<Vec<Slot>>,
@@ -20,10 +20,10 @@ pub struct Device {
     pub fault: Arc<Mutex<Option<String>>>,
 }
 
-/// A shader's layout of bindings, and a pipeline for each of its entry points.
+/// An entry point's layout of bindings and pipeline.
 pub struct Kernel {
     pub layout: wgpu::BindGroupLayout,
-    pub pipelines: Vec<wgpu::ComputePipeline>,
+    pub pipeline: wgpu::ComputePipeline,
 }
 
 /// Preference; software comes in only when asked for.
@@ -72,6 +72,7 @@ pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
     let wanted = wgpu::Limits {
         max_buffer_size: limits.max_buffer_size,
         max_storage_buffer_binding_size: limits.max_storage_buffer_binding_size,
+        max_storage_buffers_per_shader_stage: MOST_BINDINGS,
         ..wgpu::Limits::downlevel_defaults()
     };
     let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
@@ -100,22 +101,13 @@ pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
         exact_floats: false, // until the probe has said so
     };
     let tick = timed.then(|| queue.get_timestamp_period() as f64);
-    let kernels = kernels(&device)?;
+    let kernels = Shader::ALL.iter().map(|_| Default::default()).collect();
     let slots = (0..SLOTS).map(|_| Slot::default()).collect();
     let (slots, idle) = (Mutex::new(slots), Condvar::new());
     Ok((Device { device, queue, kernels, tick, slots, idle, fault }, facts))
 }
 
-fn kernels(device: &wgpu::Device) -> Result<Vec<Kernel>, String> {
-    let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
-    let kernels = Shader::ALL.iter().map(|s| kernel(device, *s)).collect();
-    match pollster::block_on(scope.pop()) {
-        Some(error) => Err(format!("a shader was refused: {error}")),
-        None => Ok(kernels),
-    }
-}
-
-fn kernel(device: &wgpu::Device, shader: Shader) -> Kernel {
+fn kernel(device: &wgpu::Device, shader: Shader, entry_point: usize) -> Kernel {
     let name = shader.name();
     let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
         binding,
@@ -123,7 +115,7 @@ fn kernel(device: &wgpu::Device, shader: Shader) -> Kernel {
         ty: wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None },
         count: None,
     };
-    let storage = |k: u32| entry(k, wgpu::BufferBindingType::Storage { read_only: k % 2 == 1 });
+    let storage = |k: u32| entry(k, wgpu::BufferBindingType::Storage { read_only: !shader.writes(k as usize) });
     let mut entries = vec![entry(0, wgpu::BufferBindingType::Uniform)];
     entries.extend((1..=shader.bindings() as u32).map(storage));
     let desc = wgpu::BindGroupLayoutDescriptor { label: Some(name), entries: &entries };
@@ -137,24 +129,22 @@ fn kernel(device: &wgpu::Device, shader: Shader) -> Kernel {
         label: Some(name),
         source: wgpu::ShaderSource::Wgsl(shader.text().into()),
     });
-    let pipeline = |entry: &&str| {
-        device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some(name),
-            layout: Some(&shared),
-            module: &module,
-            entry_point: Some(entry),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            cache: None,
-        })
-    };
-    let pipelines = shader.entries().iter().map(pipeline).collect();
-    Kernel { layout, pipelines }
+    let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(name),
+        layout: Some(&shared),
+        module: &module,
+        entry_point: Some(shader.entries()[entry_point]),
+        compilation_options: wgpu::PipelineCompilationOptions::default(),
+        cache: None,
+    });
+    Kernel { layout, pipeline }
 }
 
 impl Device {
-    pub fn kernel(&self, shader: Shader) -> &Kernel {
+    /// The pipeline of an entry point. What the driver says against it comes through the device's error scopes.
+    pub fn kernel(&self, shader: Shader, entry: usize) -> &Kernel {
         let place = Shader::ALL.iter().position(|s| *s == shader).expect("ALL holds every shader");
-        &self.kernels[place]
+        self.kernels[place][entry].get_or_init(|| kernel(&self.device, shader, entry))
     }
 
     /// Whether a call would have to wait for a slot.

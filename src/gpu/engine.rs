@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::device::{self, Device, SlotGuard};
 use super::facts::{GpuFacts, GpuKind};
-use super::record::{Command, Dispatch, PARAMS_STRIDE, Recording, STAMP_BYTES, groups};
+use super::record::{Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Recording, STAMP_BYTES, groups};
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
 /// stays silent for longer is taken for lost.
@@ -317,8 +317,9 @@ fn encode(
     for run in commands.chunk_by(|a, b| matches!((a, b), (Command::Dispatch(_), Command::Dispatch(_)))) {
         match &run[0] {
             Command::Readback(r) => {
-                encoder.copy_buffer_to_buffer(slot.of(r.from), 0, slot.read.get(), r.to, r.bytes);
+                encoder.copy_buffer_to_buffer(slot.of(r.from.buffer), r.from.from, slot.read.get(), r.to, r.bytes);
             }
+            Command::Clear(buffer) => encoder.clear_buffer(slot.of(*buffer), 0, Some(FLAG_BYTES)),
             Command::Dispatch(_) => {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 for command in run {
@@ -332,19 +333,17 @@ fn encode(
 }
 
 fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, pass: &mut wgpu::ComputePass) {
-    let kernel = device.kernel(d.shader);
+    let kernel = device.kernel(d.shader, d.entry);
     let size = wgpu::BufferSize::new(d.params.len() as u64);
     let params = wgpu::BufferBinding { buffer: held.slot.params.get(), offset, size };
     let mut entries = vec![wgpu::BindGroupEntry { binding: 0, resource: wgpu::BindingResource::Buffer(params) }];
-    entries.extend(
-        d.bind
-            .iter()
-            .zip(1..)
-            .map(|(b, binding)| wgpu::BindGroupEntry { binding, resource: held.slot.of(*b).as_entire_binding() }),
-    );
+    entries.extend(d.bind.iter().zip(1..).map(|(b, binding)| {
+        let buffer = wgpu::BufferBinding { buffer: held.slot.of(b.buffer), offset: b.from, size: None };
+        wgpu::BindGroupEntry { binding, resource: wgpu::BindingResource::Buffer(buffer) }
+    }));
     let desc = wgpu::BindGroupDescriptor { label: None, layout: &kernel.layout, entries: &entries };
     let bind = device.device.create_bind_group(&desc);
-    pass.set_pipeline(&kernel.pipelines[d.entry]);
+    pass.set_pipeline(&kernel.pipeline);
     pass.set_bind_group(0, &bind, &[]);
     let [x, y] = groups(d.threads);
     pass.dispatch_workgroups(x, y, 1);

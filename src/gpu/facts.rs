@@ -118,6 +118,9 @@ pub fn occlusion_map(dtype: DType, missing: bool) -> Result<(), &'static str> {
 /// Why an occlusion map stays on the CPU where a cell of its last level sees too many voxels.
 pub const MAP_TOO_LARGE: &str = "a cell of the occlusion map does not fit the GPU's buffers: runs on the CPU";
 
+/// The same for windows.
+pub const WINDOW_TOO_LARGE: &str = "a window does not fit the GPU's buffers: runs on the CPU";
+
 /// How far floats of the GPU may be from the CPU's. What is not here is the same bit for bit.
 pub mod tolerance {
     /// Components and magnitudes of gradients, times the range of the window's values over the (least) spacing. The sums of

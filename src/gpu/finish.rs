@@ -1,8 +1,11 @@
-//! What the device makes of moments of f32, so that only results come back: channels as the shader knows them, and the
-//! dispatch.
+//! What the device makes of sums and moments of windows, so that only results come back: channels as the shaders know them,
+//! and the dispatch.
 
-use super::passes::{Job, Part};
-use super::record::{Buffer, Dispatch, Shader};
+use super::passes::{self, Job, Part, Quantity};
+use super::record::{Bind, Buffer, Shader};
+use super::recorder::{Planes, Recorder};
+use crate::grid::Affine;
+use crate::kernel::window::finish::Width;
 use crate::stage::{Method, Ties, WindowChannel, WindowParams};
 
 /// Most channels of one dispatch.
@@ -21,61 +24,147 @@ pub struct Finish {
     pub count: u32,
     pub zero: u32,
     pub threads: u32,
-    pub spare: u32,
+    pub stride: u32,
+    pub channels: [u32; MOST],
+}
+
+/// The same for windows of small integers; `struct Codes` of `shaders/window_codes.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Codes {
+    pub out: [u32; 2],
+    pub centre: u32,
+    pub plane: u32,
+    pub row: u32,
+    pub packing: u32,
+    pub flip: u32,
+    pub wide: u32,
+    pub at: [u32; 3],
+    pub radius: [u32; 3],
+    pub size: [u32; 3],
+    pub centred: u32,
+    pub count: u32,
+    pub stride: u32,
+    pub flipped: u32,
+    pub scaled: u32,
+    pub threads: u32,
+    pub needs: u32,
+    pub slope: [u32; 2],
+    pub intercept: [u32; 2],
     pub channels: [u32; MOST],
 }
 
 /// Channels that the device finishes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Channels {
     codes: [u32; MOST],
     count: usize,
     flipped: bool,
+    affine: Affine,
 }
 
 impl Channels {
-    /// `None` where values are scaled (f64 does that on the CPU), or a channel has no code.
-    pub fn of(params: &WindowParams, channels: &[WindowChannel]) -> Option<Channels> {
-        if !params.affine.is_identity() || channels.len() > MOST {
+    /// `None` where a channel has no code, or values of f32 (`real`) are scaled (f64 does that on the CPU).
+    pub fn of(params: &WindowParams, channels: &[WindowChannel], real: bool) -> Option<Channels> {
+        if real && !params.affine.is_identity() || channels.len() > MOST {
             return None;
         }
         let mut codes = [0; MOST];
         for (to, channel) in codes.iter_mut().zip(channels) {
             *to = code(*channel)?;
         }
-        Some(Channels { codes, count: channels.len(), flipped: params.flipped() })
+        Some(Channels { codes, count: channels.len(), flipped: params.flipped(), affine: params.affine })
     }
 
     pub fn count(&self) -> usize {
         self.count
     }
 
-    /// Bytes of all results of a part, one channel after the other.
-    pub fn bytes(&self, part: &Part) -> u64 {
-        part.dst.iter().map(|&n| n as u64).product::<u64>() * 4 * self.count as u64
+    /// Whether a channel is one of these.
+    fn asks(&self, codes: &[u32]) -> bool {
+        self.codes[..self.count].iter().any(|c| codes.contains(c))
     }
 
-    /// From voxels, extremes and cells of `cell` words (0: none) to results.
-    pub(super) fn dispatch(&self, job: &Job, part: &Part, cell: usize) -> Dispatch {
+    /// From voxels, of which the part's source is all, and what was made of their windows to results.
+    pub(super) fn record(
+        &self,
+        job: &Job,
+        part: &Part,
+        from: Bind,
+        made: &[(Quantity, Buffer)],
+        to: &mut Recorder,
+    ) -> Planes {
         let pitch = job.pitch(part);
         let strides = [part.src[1] * pitch, pitch, 1];
         let centre: usize = (0..3).map(|a| (job.at[a] + part.lo[a] - part.from[a]) * strides[a]).sum();
-        let threads = part.dst.iter().product::<usize>() as u32;
-        let finish = Finish {
-            out: part.dst.map(|n| n as u32),
+        let voxels = part.dst.iter().product::<usize>();
+        let planes = Planes::take(to, voxels, self.count);
+        // What was not made is not looked at, and its binding may be anything.
+        let of = |wanted: fn(&Quantity) -> bool| {
+            let found = made.iter().find(|(q, _)| wanted(q));
+            found.map_or(from, |f| f.1.into())
+        };
+        let source = [from, Bind::from(planes.buffer)];
+        let threads = voxels as u32;
+        if job.real {
+            let cell = if job.needs.mean { passes::cell(job.needs.variance) } else { 0 };
+            let finish = Finish {
+                out: part.dst.map(|n| n as u32),
+                centre: centre as u32,
+                plane: strides[0] as u32,
+                row: strides[1] as u32,
+                cell: cell as u32,
+                flipped: self.flipped as u32,
+                count: self.count as u32,
+                threads,
+                stride: planes.stride,
+                channels: self.codes,
+                ..Finish::default()
+            };
+            let order = of(|q| *q == Quantity::Order);
+            let bind = [source[0], source[1], order, of(|q| matches!(q, Quantity::Moments { .. }))];
+            to.dispatch(Shader::Finish, 0, &finish, &bind, threads);
+            return planes;
+        }
+        let wide = |squares: bool| made.iter().any(|(q, _)| *q == Quantity::Sum { square: squares, wide: true });
+        let bits = |v: f64| [v.to_bits() as u32, (v.to_bits() >> 32) as u32];
+        let codes = Codes {
+            out: [part.dst[1] as u32, part.dst[2] as u32],
             centre: centre as u32,
             plane: strides[0] as u32,
             row: strides[1] as u32,
-            cell: cell as u32,
-            flipped: self.flipped as u32,
+            packing: if job.voxel == 1 { 2 } else { 1 },
+            flip: job.flip(),
+            wide: wide(false) as u32 + 2 * wide(true) as u32,
+            at: std::array::from_fn(|a| (job.at[a] + part.lo[a]) as u32),
+            radius: job.radius.map(|r| r as u32),
+            size: job.src.map(|n| n as u32),
+            centred: match Width::of(job.count(), (1 << (8 * job.voxel)) - 1) {
+                Width::Small | Width::Direct => 0,
+                Width::Centred => 1,
+                Width::Big => 2,
+            },
             count: self.count as u32,
+            stride: planes.stride,
+            flipped: self.flipped as u32,
+            scaled: !self.affine.is_identity() as u32,
             threads,
+            needs: job.needs.mean as u32
+                + 2 * job.needs.variance as u32
+                + 4 * job.needs.extremes as u32
+                + 8 * self.asks(&[0, 5]) as u32
+                + 16 * self.asks(&[3, 4, 5]) as u32,
+            slope: bits(self.affine.slope),
+            intercept: bits(self.affine.intercept),
             channels: self.codes,
-            ..Finish::default()
         };
-        let params = bytemuck::bytes_of(&finish).to_vec();
-        let bind = vec![Buffer::Source, Buffer::B, Buffer::C, Buffer::A];
-        Dispatch { shader: Shader::Finish, entry: 0, params, bind, threads }
+        let [extremes, sums, squares] = [
+            of(|q| *q == Quantity::Extremes),
+            of(|q| matches!(q, Quantity::Sum { square: false, .. })),
+            of(|q| matches!(q, Quantity::Sum { square: true, .. })),
+        ];
+        to.dispatch(Shader::Codes, 0, &codes, &[source[0], source[1], extremes, sums, squares], threads);
+        planes
     }
 }
 
@@ -102,17 +191,17 @@ fn code(channel: WindowChannel) -> Option<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grid::Affine;
 
     #[test]
-    fn scaled_values_and_channels_without_a_code_are_finished_by_the_cpu() {
+    fn scaled_floats_and_channels_without_a_code_are_finished_by_the_cpu() {
         let params = WindowParams { radius: [1; 3], affine: Affine::IDENTITY, missing: None, solid_low: true };
         let open = |m| WindowChannel::Openness(m, Ties::Mid);
-        let made = Channels::of(&params, &[WindowChannel::Mean, open(Method::Chebyshev)]).unwrap();
+        let made = Channels::of(&params, &[WindowChannel::Mean, open(Method::Chebyshev)], true).unwrap();
         assert_eq!((made.count(), &made.codes[..3], made.flipped), (2, &[0, 264, 0][..], true));
-        assert!(Channels::of(&params, &[open(Method::Beta)]).is_none());
-        assert!(Channels::of(&params, &[WindowChannel::Mean; MOST + 1]).is_none());
+        assert!(Channels::of(&params, &[open(Method::Beta)], false).is_none());
+        assert!(Channels::of(&params, &[WindowChannel::Mean; MOST + 1], false).is_none());
         let scaled = WindowParams { affine: Affine { slope: 2.0, intercept: 0.0 }, ..params };
-        assert!(Channels::of(&scaled, &[WindowChannel::Mean]).is_none());
+        assert!(Channels::of(&scaled, &[WindowChannel::Mean], true).is_none());
+        assert!(Channels::of(&scaled, &[WindowChannel::Mean], false).is_some());
     }
 }

@@ -7,7 +7,7 @@ use super::passes::{self, Job, Part, Quantity, result_bytes};
 use super::slopes::MARKED;
 use super::windows::cast;
 use crate::brick::Voxels;
-use crate::grid::{AnyView, AnyViewMut, Region, View, Voxel};
+use crate::grid::{AnyView, AnyViewMut, Region, View, ViewMut, Voxel};
 use crate::kernel::Context;
 use crate::kernel::window::finish_floats::{Moments, finish_floats};
 use crate::kernel::window::{self, Place, WindowOut};
@@ -42,15 +42,28 @@ pub(super) fn finish(
 /// Copies results, one plane per channel, to their rows.
 pub(super) fn store_all(results: &[u32], part: &Part, outs: &mut [WindowOut]) {
     let n: usize = part.dst.iter().product();
-    outs.iter_mut().enumerate().for_each(|(c, out)| store(&results[c * n..][..n], part, &mut out.dst));
+    // Planes come back from multiples of 256 bytes on.
+    let plane = n.next_multiple_of(64);
+    outs.iter_mut().enumerate().for_each(|(c, out)| store(&results[c * plane..][..n], part, &mut out.dst));
 }
 
 fn store(results: &[u32], part: &Part, dst: &mut AnyViewMut) {
-    let AnyViewMut::F32(dst) = dst else { unreachable!("the device makes f32") };
-    let ([nz, ny, nx], [z0, y0, x0]) = (part.dst, part.lo);
-    for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-        let row: &[f32] = bytemuck::cast_slice(&results[(z * ny + y) * nx..][..nx]);
-        dst.row_at(z0 + z, y0 + y)[x0..x0 + nx].copy_from_slice(row);
+    fn rows<T: Voxel>(d: &mut ViewMut<T>, results: &[f32], part: &Part, cast: impl Fn(f32) -> T) {
+        let ([nz, ny, nx], [z0, y0, x0]) = (part.dst, part.lo);
+        for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
+            let row = d.row_at(z0 + z, y0 + y)[x0..x0 + nx].iter_mut();
+            row.zip(&results[(z * ny + y) * nx..]).for_each(|(d, r)| *d = cast(*r));
+        }
+    }
+    let results: &[f32] = bytemuck::cast_slice(results);
+    match dst {
+        AnyViewMut::F32(d) => rows(d, results, part, |r| r),
+        // Extremes of small integers, which f32 holds.
+        AnyViewMut::U8(d) => rows(d, results, part, |r| r as u8),
+        AnyViewMut::I8(d) => rows(d, results, part, |r| r as i8),
+        AnyViewMut::U16(d) => rows(d, results, part, |r| r as u16),
+        AnyViewMut::I16(d) => rows(d, results, part, |r| r as i16),
+        other => unreachable!("the device makes no {}", other.dtype()),
     }
 }
 
@@ -151,7 +164,7 @@ fn number(code: u32) -> f32 {
 }
 
 fn put(dst: &mut AnyViewMut, at: [usize; 3], value: f64) {
-    fn set<T: Voxel>(d: &mut crate::grid::ViewMut<T>, at: [usize; 3], value: f64) {
+    fn set<T: Voxel>(d: &mut ViewMut<T>, at: [usize; 3], value: f64) {
         d.set(at, T::from_f64(value));
     }
     crate::with_view!(AnyViewMut, dst, d => set(d, at, value))

@@ -83,7 +83,9 @@ impl Rows<'_> {
     /// Row `[z, y]` of component `c`, or of the magnitudes.
     fn row(&self, c: usize, [z, y]: [usize; 2]) -> &[u32] {
         let [nz, ny, nx] = self.part.dst;
-        &self.sums[((c * nz + z) * ny + y) * nx..][..nx]
+        // Planes come back from multiples of 256 bytes on.
+        let plane = (nz * ny * nx).next_multiple_of(64);
+        &self.sums[c * plane + (z * ny + y) * nx..][..nx]
     }
 
     /// Scales and stores; what is marked is rubbish.

@@ -1,9 +1,12 @@
 //! Occlusion maps: the chain of levels of a brick recorded, cut into parts that fit. Pure arithmetic, shared by planner and
 //! engine. Boxes are counted from the start of the map's region.
 
+use super::levels::{Codes, MAP_KINDS, Slab};
 use super::passes::{largest, packed, parts_within};
-use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
-use crate::grid::{DType, Region, Shape};
+use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::recorder::Recorder;
+use crate::grid::{Affine, DType, Region, Shape};
+use crate::kernel::convert::Mapping;
 use crate::kernel::occlusion_map::{full_weights, needed};
 
 /// What one dispatch does; `struct Pool` of `shaders/map_pool.wgsl`, which explains the fields.
@@ -47,6 +50,28 @@ pub struct MapJob {
 
 /// Words of a cell.
 pub const CELL: usize = 3;
+
+/// What an output takes of a map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapCodes {
+    /// The first level that is stored.
+    pub first: usize,
+    /// By component: 0 for the mean, 1 for the variance.
+    pub moments: Vec<usize>,
+    pub dtype: DType,
+    pub mapping: Mapping,
+    pub affine: Affine,
+    /// The cells of the last level are kept.
+    pub cells: bool,
+}
+
+impl MapCodes {
+    fn of(&self, moment: usize) -> Codes {
+        let squared = Affine { slope: self.affine.slope * self.affine.slope, intercept: 0.0 };
+        let affine = [self.affine, squared][moment];
+        Codes { dtype: self.dtype, mapping: self.mapping, kind: MAP_KINDS[moment], affine }
+    }
+}
 
 impl MapJob {
     /// `levels` up to the last that bricks make. `None` if voxels of this type have no kernel here, or no level is made.
@@ -113,7 +138,10 @@ impl MapJob {
     }
 
     fn sizes(&self, part: Region) -> Sizes {
-        self.record(part).sizes
+        // With the most that an output takes.
+        let (dtype, mapping, affine) = (DType::F32, Mapping::KEEP, Affine::IDENTITY);
+        let codes = MapCodes { first: 0, moments: vec![0, 1], dtype, mapping, affine, cells: true };
+        self.record(part).sizes.max(self.recorded(part, Some(&codes)).0.sizes)
     }
 
     /// Largest buffers of any part.
@@ -121,42 +149,50 @@ impl MapJob {
         largest(self.parts(brick, cap), |p| self.sizes(*p))
     }
 
-    /// Every level of a part, axis by axis, each read back when it is made.
+    /// Every level of a part, axis by axis, each read back when it is made: its cells, or with `codes` those that the part
+    /// owns in an output's type, one component after the other, and the cells of the last one.
     pub fn record(&self, part: Region) -> Recording {
+        self.recorded(part, None).0
+    }
+
+    /// As [`Self::record`], and where the codes of every level from 1 on and the last one's cells stand.
+    pub(super) fn recorded(&self, part: Region, codes: Option<&MapCodes>) -> (Recording, Vec<Vec<u64>>, u64) {
         let boxes = self.boxes(part);
         let pitch = self.pitch(boxes[0]);
         let source = boxes[0].shape()[0] * boxes[0].shape()[1] * pitch * self.voxel;
-        let mut recording = Recording::default();
+        let mut recorder = Recorder::new(source as u64);
+        let (mut places, mut last) = (Vec::new(), 0);
         let mut from = Grid { region: boxes[0], buffer: Buffer::Source, pitch };
         for k in 1..boxes.len() {
             let (fine, halved) = (self.levels[k - 1].shape, self.levels[k].halved);
             let want = needed(boxes[k], halved, fine);
             for axis in (0..3).filter(|&a| halved[a]) {
-                from = self.pass(&mut recording, &from, want, boxes[k], axis, fine[axis]);
+                let next = self.pass(&mut recorder, &from, want, boxes[k], axis, fine[axis]);
+                recorder.give(from.buffer);
+                from = next;
             }
-            let place = self.place(&boxes, k);
-            let (bytes, to) = (place.len() as u64, place.start as u64);
-            recording.commands.push(Command::Readback(Readback { from: from.buffer, bytes, to }));
-            recording.sizes.read = rounded(place.end as u64);
+            let own = self.own(k, part);
+            let stored: Option<Vec<Codes>> =
+                codes.map(|c| c.moments.iter().filter(|_| k >= c.first).map(|m| c.of(*m)).collect());
+            let slab = Slab { bind: from.buffer.into(), region: boxes[k], pitch: boxes[k].shape()[2] };
+            let one = |c: Codes| c.write(slab.bind, slab.start(&own), own.shape(), true, &mut recorder);
+            places.push(stored.unwrap_or_default().into_iter().map(one).collect());
+            if codes.is_none_or(|c| c.cells && k + 1 == boxes.len()) {
+                last = recorder.read(from.buffer.into(), self.place(&boxes, k).len() as u64);
+            }
         }
-        let dispatches = recording.dispatches().count() as u64;
-        recording.sizes.params = dispatches * PARAMS_STRIDE;
-        recording.sizes.tables = rounded(recording.tables.len() as u64 * 4);
-        recording.sizes.source = rounded(source as u64);
-        recording
+        (recorder.finish().expect("a map takes few buffers"), places, last)
     }
 
     /// Halves one axis of the `n` cells of a level; of the axes that are not done yet, only what is wanted goes on.
-    fn pass(&self, to: &mut Recording, from: &Grid, want: Region, coarse: Region, axis: usize, n: usize) -> Grid {
+    fn pass(&self, to: &mut Recorder, from: &Grid, want: Region, coarse: Region, axis: usize, n: usize) -> Grid {
         // Axes up to this one are in coarse cells, or are not halved, and then both boxes say the same of them.
         let lo: [i64; 3] = std::array::from_fn(|a| if a <= axis { coarse.lo[a] } else { want.lo[a] });
         let hi = std::array::from_fn(|a| if a <= axis { coarse.hi[a] } else { want.hi[a] });
         let region = Region::new(lo, hi);
         let start = from.region.lo[axis];
-        let weights = to.tables.len() as u32;
-        for i in coarse.lo[axis]..coarse.hi[axis] {
-            to.tables.extend(full_weights(i, n as i64).map(|w| (w as f32).to_bits()));
-        }
+        let cells = coarse.lo[axis]..coarse.hi[axis];
+        let weights = to.table(cells.flat_map(|i| full_weights(i, n as i64)).map(|w| (w as f32).to_bits()));
         let shift = |a: usize| if a == axis { 0 } else { (lo[a] - from.region.lo[a]) as u32 };
         let pool = Pool {
             out: region.shape().map(|n| n as u32),
@@ -173,17 +209,9 @@ impl MapJob {
             threads: region.voxels() as u32,
             ..Pool::default()
         };
-        let buffer = if from.buffer == Buffer::A { Buffer::B } else { Buffer::A };
-        let bytes = rounded((region.voxels() * 4 * CELL) as u64);
-        let held = if buffer == Buffer::A { &mut to.sizes.a } else { &mut to.sizes.b };
-        *held = bytes.max(*held);
-        to.commands.push(Command::Dispatch(Dispatch {
-            shader: Shader::MapPool,
-            entry: (from.buffer != Buffer::Source) as usize,
-            params: bytemuck::bytes_of(&pool).to_vec(),
-            bind: vec![from.buffer, buffer, Buffer::Tables],
-            threads: pool.threads,
-        }));
+        let buffer = to.take((region.voxels() * 4 * CELL) as u64);
+        let bind = [from.buffer, buffer, Buffer::Tables].map(Bind::from);
+        to.dispatch(Shader::MapPool, (from.buffer != Buffer::Source) as usize, &pool, &bind, pool.threads);
         Grid { region, buffer, pitch: region.shape()[2] }
     }
 }

@@ -1,17 +1,17 @@
-//! The GPU lane through wgpu. Window sums and extremes of small integers and obscurance are exact integers, finished by the
-//! CPU kernels' own row functions, so that a GPU's results equal the CPU's bit for bit; floats hold the tolerances that
-//! [`facts::tolerance`] states.
+//! The GPU lane through wgpu. Window sums and extremes of small integers and obscurance are exact integers; statistics, steps
+//! that look at one voxel, levels and conversions are made in f64 that shaders build of integers. All of these equal the CPU's
+//! bit for bit; floats hold the tolerances that [`facts::tolerance`] states.
 //!
 //! | file | holds |
 //! |---|---|
 //! | `facts` | what the planner knows of an adapter; which stages have kernels |
-//! | `record` | the device's work as data: buffers, dispatches, what comes back |
+//! | `record`, `recorder` | the device's work as data: buffers, dispatches, what comes back; put together |
 //! | `shaders` | their texts, put together of what they share |
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
 //! | `maps`, `occlusion` | occlusion maps recorded, and called |
-//! | `finish` | results of f32 windows made of moments there |
-//! | `chain`, `smoothed` | a Gaussian and what reads it, recorded together and called |
+//! | `finish`, `points`, `levels` | results of windows, steps that look at one voxel, pyramids, recorded |
+//! | `flow`, `flow_steps`, `flow_call` | several steps and their levels recorded together, and called |
 //! | `nodes` | whether a machine can have a GPU at all |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
@@ -19,32 +19,38 @@
 //!
 //! Everything above `device` knows no wgpu.
 
-pub mod chain;
 pub mod device;
 pub mod engine;
 pub mod facts;
 pub mod finish;
 mod float_windows;
+pub mod flow;
+mod flow_call;
+mod flow_steps;
 mod gaussian;
 mod gradient;
+pub mod levels;
 pub mod maps;
 mod nodes;
 mod obscurance;
 mod occlusion;
 pub mod pairs;
 pub mod passes;
+pub mod points;
 mod probe;
 pub mod record;
+pub mod recorder;
 pub mod shaders;
 pub mod slopes;
 mod slot;
-mod smoothed;
 pub mod sweep;
 pub mod taps;
 mod windows;
 
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind};
+pub use flow_call::SinkOut;
+pub use occlusion::MapLevels;
 
 use crate::config::Device;
 

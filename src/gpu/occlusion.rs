@@ -2,9 +2,11 @@
 
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::facts;
-use super::maps::{CELL, MapJob};
+use super::flow_call;
+use super::maps::{CELL, MapCodes, MapJob};
 use super::passes::Part;
 use super::windows::{cast, pack};
+use crate::brick::Voxels;
 use crate::grid::{Affine, AnyView, Region};
 use crate::kernel::occlusion_map::Moments;
 
@@ -47,6 +49,70 @@ impl Gpu {
                 run_part(device, &job.record(part), &mut fill, &mut done, &mut times)?;
             }
             Ok((levels, times))
+        })
+    }
+}
+
+/// The levels of a map that a brick owns, as an output stores them.
+#[derive(Debug)]
+pub struct MapLevels {
+    /// By level from 1 on and component; none of levels that are not stored.
+    pub codes: Vec<Vec<Voxels>>,
+    /// The last level, where its cells are kept.
+    pub last: Option<Moments>,
+}
+
+impl Gpu {
+    /// As [`Gpu::occlusion_levels`], in an output's type: what [`crate::kernel::convert::convert`] makes of those levels, bit
+    /// for bit.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn occlusion_codes(
+        &self,
+        src: AnyView,
+        src_box: Region,
+        job: &MapJob,
+        brick: Region,
+        codes: &MapCodes,
+    ) -> Result<MapLevels, GpuError> {
+        facts::occlusion_map(src.dtype(), false).map_err(|e| GpuError(e.into()))?;
+        let parts = job.parts(brick, self.cap()).ok_or_else(|| GpuError("a cell does not fit its buffers".into()))?;
+        let end = job.levels() - 1;
+        self.attempt(|device| {
+            let of = |k: usize| {
+                let count = if k >= codes.first { codes.moments.len() } else { 0 };
+                (0..count).map(|_| Voxels::zeroed(codes.dtype, job.own(k, brick).voxels())).collect()
+            };
+            let mut made = MapLevels {
+                codes: (1..=end).map(of).collect(),
+                last: codes.cells.then(|| room(job.own(end, brick).voxels())),
+            };
+            for &part in &parts {
+                let boxes = job.boxes(part);
+                let shape = boxes[0].shape();
+                let seen = Part { lo: [0; 3], dst: shape, from: src_box.offset_of(&boxes[0]), src: shape };
+                let pitch = job.pitch(boxes[0]) * job.voxel;
+                let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, pitch, out);
+                let (recording, places, last) = job.recorded(part, Some(codes));
+                let mut done = |bytes: Option<&[u8]>| {
+                    let bytes = bytes.unwrap_or_default();
+                    for (k, (places, levels)) in (1..).zip(places.iter().zip(&mut made.codes)) {
+                        let (own, all) = (job.own(k, part), job.own(k, brick));
+                        for (place, to) in places.iter().zip(levels) {
+                            let mut view = to.view_mut(all.shape());
+                            flow_call::paste(&bytes[*place as usize..], own.shape(), all.offset_of(&own), &mut view);
+                        }
+                    }
+                    if let Some(to) = &mut made.last {
+                        let cells = cast(&bytes[last as usize..][..boxes[end].voxels() * 4 * CELL])?;
+                        paste(cells, boxes[end], job.own(end, part), job.own(end, brick), codes.affine, to);
+                    }
+                    Ok(())
+                };
+                run_part(device, &recording, &mut fill, &mut done, &mut Times::default())?;
+            }
+            Ok(made)
         })
     }
 }

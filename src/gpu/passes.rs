@@ -2,7 +2,8 @@
 //! shared by planner and engine.
 
 use super::finish::Channels;
-use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
+use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::recorder::{Planes, Recorder};
 use crate::grid::{DType, Shape};
 use crate::kernel::window::Needs;
 use crate::stage::{WindowChannel, WindowParams};
@@ -80,7 +81,7 @@ pub struct Job {
     /// f32.
     pub real: bool,
     pub needs: Needs,
-    /// What the device makes of moments of f32; `None`: they come back as they are.
+    /// What the device makes of sums and moments; `None`: they come back as they are.
     pub finish: Option<Channels>,
 }
 
@@ -114,13 +115,26 @@ impl Job {
         Job { place, ..self }
     }
 
-    /// With what the device makes of windows of f32, where these channels can be made there.
+    /// With what the device makes of windows, where these channels can be made there.
     pub fn finished(self, params: &WindowParams, channels: &[WindowChannel]) -> Job {
-        Job { finish: Channels::of(params, channels).filter(|_| self.real), ..self }
+        Job { finish: Channels::of(params, channels, self.real), ..self }
+    }
+
+    /// Whether a single window fits wherever it lies in a volume of this extent.
+    pub fn fits(&self, volume: Shape, cap: u64) -> bool {
+        let src = std::array::from_fn(|a| (2 * self.radius[a] + 1).min(volume[a]));
+        let at = std::array::from_fn(|a| self.radius[a].min(src[a] - 1));
+        let one = Job { src, dst: [1; 3], at, place: [0; 3], ..*self };
+        one.record(&one.part([0; 3], [1; 3])).sizes.largest() <= cap
+    }
+
+    /// What codes are more than values: the sign bit, which two's complement has the other way around.
+    pub(super) fn flip(&self) -> u32 {
+        if self.signed { 1 << (8 * self.voxel - 1) } else { 0 }
     }
 
     /// Most voxels of a window.
-    fn count(&self) -> u64 {
+    pub(super) fn count(&self) -> u64 {
         (0..3).map(|a| (2 * self.radius[a] + 1).min(self.src[a]) as u64).product()
     }
 
@@ -157,23 +171,7 @@ impl Job {
     }
 
     pub fn sizes(&self, part: &Part) -> Sizes {
-        let quantities = self.quantities();
-        let element = quantities.iter().map(|q| q.bytes()).max().unwrap_or(4);
-        let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
-        let ([nz, ny, nx], [mz, my, _]) = (part.src, part.dst);
-        let b = rounded(product([mz, my, nx]) * element);
-        let raw = quantities.iter().map(|q| rounded(product(part.dst) * q.bytes())).sum::<u64>();
-        let results = self.finish.map(|f| rounded(product(part.dst) * 4 * f.count() as u64));
-        Sizes {
-            params: (3 * quantities.len() as u64 + 1) * PARAMS_STRIDE,
-            tables: 0,
-            source: rounded(product([nz, ny, self.pitch(part)]) * self.voxel as u64),
-            a: rounded(product([mz, ny, nx]) * element),
-            b: b.max(results.unwrap_or(0)),
-            c: results.map_or(0, |_| rounded(product(part.dst) * Quantity::Order.bytes())),
-            d: 0,
-            read: results.unwrap_or(raw).max(256),
-        }
+        self.record(part).sizes
     }
 
     /// Parts of which every buffer is at most `cap` bytes: halves along z first, since cuts there keep rows whole and cost
@@ -215,7 +213,7 @@ impl Job {
             out_j: nx,
             lines: nx,
             packing: [2, 1, 0, 0][self.voxel - 1],
-            flip: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
+            flip: self.flip(),
             ..axis(0)
         };
         let y =
@@ -244,13 +242,42 @@ impl Job {
         [shared(z, ny), shared(y, mz), shared(x, mz)]
     }
 
-    /// Every quantity of a part: three passes, then what comes back, one quantity after the other; or what the device makes
-    /// of all of them.
+    /// Every quantity of a part, then what comes back, one quantity after the other; or what the device makes of all of
+    /// them, one channel after the other.
     pub fn record(&self, part: &Part) -> Recording {
-        use Buffer::{A, B, C, Source};
-        let mut commands = Vec::new();
-        let mut to = 0;
-        for quantity in self.quantities() {
+        let [nz, ny, _] = part.src;
+        let mut recorder = Recorder::new((nz * ny * self.pitch(part) * self.voxel) as u64);
+        match self.finish {
+            Some(channels) => {
+                let planes = self.results(part, Buffer::Source.into(), &channels, &mut recorder);
+                let bytes = part.dst.iter().product::<usize>() as u64 * 4;
+                for c in 0..channels.count() {
+                    recorder.read(planes.plane(c), bytes);
+                }
+            }
+            None => {
+                for (quantity, made) in self.made(part, Buffer::Source.into(), &mut recorder) {
+                    recorder.read(made.into(), result_bytes(part, quantity));
+                    recorder.give(made);
+                }
+            }
+        }
+        recorder.finish().expect("windows take few buffers")
+    }
+
+    /// What the channels are, left on the device.
+    pub(super) fn results(&self, part: &Part, from: Bind, channels: &Channels, to: &mut Recorder) -> Planes {
+        let made = self.made(part, from, to);
+        let planes = channels.record(self, part, from, &made, to);
+        made.iter().for_each(|(_, b)| to.give(*b));
+        planes
+    }
+
+    /// Every quantity in a buffer of its own, from voxels of which the part's source is all.
+    fn made(&self, part: &Part, from: Bind, to: &mut Recorder) -> Vec<(Quantity, Buffer)> {
+        let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
+        let ([_, ny, nx], [mz, my, _]) = (part.src, part.dst);
+        let one = |quantity: Quantity| {
             let shader = match quantity {
                 Quantity::Extremes => Shader::Extremes,
                 Quantity::Sum { wide: false, .. } => Shader::Sums32,
@@ -258,25 +285,18 @@ impl Job {
                 Quantity::Order => Shader::Order,
                 Quantity::Moments { .. } => Shader::Moments,
             };
-            let last = if self.finish.is_some() && quantity == Quantity::Order { C } else { A };
+            let last = to.take(result_bytes(part, quantity));
+            let [a, b] = [[mz, ny, nx], [mz, my, nx]].map(|s| to.take(product(s) * quantity.bytes()));
+            let [a, b, last] = [a, b, last].map(Bind::from);
             for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
-                let bind = [[Source, A], [A, B], [B, last]][axis].to_vec();
-                let params = bytemuck::bytes_of(&pass).to_vec();
-                let entry = (axis > 0) as usize;
-                commands.push(Command::Dispatch(Dispatch { shader, entry, params, bind, threads: pass.threads }));
+                let bind = [[from, a], [a, b], [b, last]][axis];
+                to.dispatch(shader, (axis > 0) as usize, &pass, &bind, pass.threads);
             }
-            if self.finish.is_none() {
-                let bytes = result_bytes(part, quantity);
-                commands.push(Command::Readback(Readback { from: A, bytes, to }));
-                to += bytes.next_multiple_of(256);
-            }
-        }
-        if let Some(channels) = &self.finish {
-            let cell = if self.needs.mean { cell(self.needs.variance) } else { 0 };
-            commands.push(Command::Dispatch(channels.dispatch(self, part, cell)));
-            commands.push(Command::Readback(Readback { from: B, bytes: channels.bytes(part), to: 0 }));
-        }
-        Recording { sizes: self.sizes(part), tables: Vec::new(), commands }
+            to.give(a.buffer);
+            to.give(b.buffer);
+            (quantity, last.buffer)
+        };
+        self.quantities().into_iter().map(one).collect()
     }
 }
 
@@ -310,6 +330,18 @@ pub struct Stored {
     pub signed: bool,
     /// f32.
     pub real: bool,
+}
+
+impl Stored {
+    pub fn dtype(self) -> DType {
+        match (self.real, self.voxel, self.signed) {
+            (true, ..) => DType::F32,
+            (_, 1, false) => DType::U8,
+            (_, 1, true) => DType::I8,
+            (_, _, false) => DType::U16,
+            (_, _, true) => DType::I16,
+        }
+    }
 }
 
 /// As [`packed`], with f32.
@@ -430,7 +462,7 @@ mod tests {
                 let recording = job.record(&part);
                 assert_eq!(recording.fault(), None);
                 assert_eq!(recording.dispatches().count(), 9);
-                let reads = recording.commands.iter().filter(|c| matches!(c, Command::Readback(_))).count();
+                let reads = recording.commands.len() - recording.dispatches().count();
                 assert_eq!(reads, job.quantities().len());
             }
         }

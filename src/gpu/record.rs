@@ -10,6 +10,9 @@ pub const STAMP_BYTES: u64 = 256;
 /// Threads of a workgroup; in every shader.
 pub const GROUP: u32 = 64;
 
+/// Buffers that a recording may work in at once.
+pub const WORK: usize = 32;
+
 /// Device buffers of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Buffer {
@@ -17,11 +20,21 @@ pub enum Buffer {
     Source,
     /// Tables, written by the host.
     Tables,
-    A,
-    B,
-    C,
-    /// Results of a first step that a second one reads.
-    D,
+    /// What dispatches write, by number.
+    Work(u8),
+}
+
+/// A buffer from a place on, which is a multiple of 256 bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bind {
+    pub buffer: Buffer,
+    pub from: u64,
+}
+
+impl From<Buffer> for Bind {
+    fn from(buffer: Buffer) -> Bind {
+        Bind { buffer, from: 0 }
+    }
 }
 
 /// One dispatch.
@@ -33,14 +46,14 @@ pub struct Dispatch {
     /// The shader's uniform struct.
     pub params: Vec<u8>,
     /// [`Shader::bindings`] of them.
-    pub bind: Vec<Buffer>,
+    pub bind: Vec<Bind>,
     pub threads: u32,
 }
 
-/// Bytes that come back, from the start of a buffer to a place of the results.
+/// Bytes that come back, from a place in a buffer to a place of the results.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Readback {
-    pub from: Buffer,
+    pub from: Bind,
     pub bytes: u64,
     pub to: u64,
 }
@@ -49,8 +62,13 @@ pub struct Readback {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Command {
     Dispatch(Dispatch),
+    /// Zeros in the first [`FLAG_BYTES`] of a buffer.
+    Clear(Buffer),
     Readback(Readback),
 }
+
+/// Bytes that [`Command::Clear`] clears.
+pub const FLAG_BYTES: u64 = 256;
 
 /// All that the device does with one part.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -65,7 +83,7 @@ impl Recording {
     pub fn dispatches(&self) -> impl Iterator<Item = &Dispatch> {
         self.commands.iter().filter_map(|c| match c {
             Command::Dispatch(d) => Some(d),
-            Command::Readback(_) => None,
+            _ => None,
         })
     }
 
@@ -77,29 +95,36 @@ impl Recording {
         if self.tables.len() as u64 * 4 > self.sizes.tables {
             return Some("too little room for tables".into());
         }
-        for command in &self.commands {
-            match command {
-                Command::Dispatch(d) => {
-                    let twice = d.bind.iter().enumerate().any(|(i, b)| d.bind[..i].contains(b));
-                    let written = d.bind.iter().skip(1).step_by(2);
-                    if d.bind.len() != d.shader.bindings() || d.entry >= d.shader.entries().len() || twice {
-                        return Some(format!("{}: bindings {:?}, entry {}", d.shader.name(), d.bind, d.entry));
-                    }
-                    if d.params.len() as u64 > PARAMS_STRIDE || d.threads == 0 {
-                        return Some(format!("{}: {} threads", d.shader.name(), d.threads));
-                    }
-                    if written.into_iter().any(|b| matches!(b, Buffer::Source | Buffer::Tables)) {
-                        return Some(format!("{} writes what the host wrote", d.shader.name()));
-                    }
-                }
-                Command::Readback(r) => {
-                    if r.bytes > self.sizes.of(r.from) || r.to + r.bytes > self.sizes.read || r.to % 256 != 0 {
-                        return Some(format!("{r:?} of {:?}", self.sizes));
-                    }
-                }
+        self.commands.iter().find_map(|command| match command {
+            Command::Dispatch(d) => self.dispatch_fault(d),
+            Command::Clear(b) if self.sizes.of(*b) < FLAG_BYTES => Some(format!("{b:?} has nothing to clear")),
+            Command::Clear(_) => None,
+            Command::Readback(r) => {
+                let wrong = r.from.from + r.bytes > self.sizes.of(r.from.buffer)
+                    || r.to + r.bytes > self.sizes.read
+                    || r.to % 256 != 0
+                    || r.bytes % 4 != 0
+                    || r.from.from % 4 != 0;
+                wrong.then(|| format!("{r:?} of {:?}", self.sizes))
             }
+        })
+    }
+
+    fn dispatch_fault(&self, d: &Dispatch) -> Option<String> {
+        // What is written may be bound once.
+        let written = || d.bind.iter().zip(1..).filter(|(_, k)| d.shader.writes(*k)).map(|(b, _)| b);
+        let twice = written().any(|w| d.bind.iter().filter(|b| b.buffer == w.buffer).count() > 1);
+        if d.bind.len() != d.shader.bindings() || d.entry >= d.shader.entries().len() || twice {
+            return Some(format!("{}: bindings {:?}, entry {}", d.shader.name(), d.bind, d.entry));
         }
-        None
+        if d.params.len() as u64 > PARAMS_STRIDE || d.threads == 0 {
+            return Some(format!("{}: {} threads", d.shader.name(), d.threads));
+        }
+        if d.bind.iter().any(|b| b.from % 256 != 0 || b.from >= self.sizes.of(b.buffer)) {
+            return Some(format!("{}: {:?} of {:?}", d.shader.name(), d.bind, self.sizes));
+        }
+        let host = written().any(|b| matches!(b.buffer, Buffer::Source | Buffer::Tables));
+        host.then(|| format!("{} writes what the host wrote", d.shader.name()))
     }
 }
 
@@ -109,10 +134,7 @@ pub struct Sizes {
     pub params: u64,
     pub tables: u64,
     pub source: u64,
-    pub a: u64,
-    pub b: u64,
-    pub c: u64,
-    pub d: u64,
+    pub work: [u64; WORK],
     /// Everything that comes back.
     pub read: u64,
 }
@@ -128,10 +150,7 @@ impl Sizes {
             params: self.params.max(o.params),
             tables: self.tables.max(o.tables),
             source: self.source.max(o.source),
-            a: self.a.max(o.a),
-            b: self.b.max(o.b),
-            c: self.c.max(o.c),
-            d: self.d.max(o.d),
+            work: std::array::from_fn(|i| self.work[i].max(o.work[i])),
             read: self.read.max(o.read),
         }
     }
@@ -140,15 +159,12 @@ impl Sizes {
         match buffer {
             Buffer::Source => self.source,
             Buffer::Tables => self.tables,
-            Buffer::A => self.a,
-            Buffer::B => self.b,
-            Buffer::C => self.c,
-            Buffer::D => self.d,
+            Buffer::Work(i) => self.work[i as usize],
         }
     }
 
     pub fn largest(self) -> u64 {
-        self.params.max(self.tables).max(self.source).max(self.a).max(self.b).max(self.c).max(self.d).max(self.read)
+        self.work.into_iter().fold(self.params.max(self.tables).max(self.source).max(self.read), u64::max)
     }
 
     /// Bytes of the upload buffer: parameters, tables, then voxels.
@@ -158,7 +174,7 @@ impl Sizes {
 
     /// Bytes of host memory that a slot takes: staging, and on a software adapter everything.
     pub fn host_bytes(self, software: bool) -> u64 {
-        let device = if software { self.upload() + self.a + self.b + self.c + self.d } else { 0 };
+        let device = if software { self.upload() + self.work.iter().sum::<u64>() } else { 0 };
         self.upload() + self.read + STAMP_BYTES + device
     }
 }
@@ -184,18 +200,24 @@ mod tests {
 
     #[test]
     fn faults_are_seen() {
-        let sizes = Sizes { params: 256, tables: 256, source: 256, a: 512, b: 256, c: 0, d: 0, read: 512 };
+        let mut work = [0; WORK];
+        work[0] = 512;
+        let sizes = Sizes { params: 256, tables: 256, source: 256, work, read: 512 };
+        let a = Buffer::Work(0);
         let dispatch = |bind: &[Buffer]| {
             let (shader, params) = (Shader::Sums32, vec![0; 80]);
-            Command::Dispatch(Dispatch { shader, entry: 0, params, bind: bind.to_vec(), threads: 1 })
+            let bind = bind.iter().map(|b| Bind::from(*b)).collect();
+            Command::Dispatch(Dispatch { shader, entry: 0, params, bind, threads: 1 })
         };
-        let back = |bytes| Command::Readback(Readback { from: Buffer::A, bytes, to: 0 });
+        let back = |from, bytes| Command::Readback(Readback { from: Bind { buffer: a, from }, bytes, to: 0 });
         let of = |commands: Vec<Command>| Recording { sizes, tables: vec![], commands }.fault();
-        assert_eq!(of(vec![dispatch(&[Buffer::Source, Buffer::A]), back(512)]), None);
-        assert!(of(vec![dispatch(&[Buffer::A, Buffer::A])]).is_some());
-        assert!(of(vec![dispatch(&[Buffer::A])]).is_some());
-        assert!(of(vec![dispatch(&[Buffer::A, Buffer::Tables])]).is_some());
-        assert!(of(vec![back(513)]).is_some());
-        assert!(of(vec![dispatch(&[Buffer::Source, Buffer::A]); 2]).is_some(), "parameters of two");
+        assert_eq!(of(vec![dispatch(&[Buffer::Source, a]), Command::Clear(a), back(0, 512), back(256, 256)]), None);
+        assert!(of(vec![dispatch(&[a, a])]).is_some());
+        assert!(of(vec![dispatch(&[a])]).is_some());
+        assert!(of(vec![dispatch(&[a, Buffer::Tables])]).is_some());
+        assert!(of(vec![dispatch(&[Buffer::Source, Buffer::Work(1)])]).is_some(), "a buffer of no bytes");
+        assert!(of(vec![back(0, 516)]).is_some() && of(vec![back(256, 260)]).is_some());
+        assert!(of(vec![Command::Clear(Buffer::Work(1))]).is_some());
+        assert!(of(vec![dispatch(&[Buffer::Source, a]); 2]).is_some(), "parameters of two");
     }
 }

@@ -30,10 +30,16 @@ pub enum Shader {
     GaussianVariance,
     Finish,
     MapPool,
+    Codes,
+    LevelPool,
+    LevelWrite,
+    Point,
+    Marks,
+    SweepCodes,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 11] = [
+    pub const ALL: [Shader; 17] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -45,6 +51,12 @@ impl Shader {
         Shader::GaussianVariance,
         Shader::Finish,
         Shader::MapPool,
+        Shader::Codes,
+        Shader::LevelPool,
+        Shader::LevelWrite,
+        Shader::Point,
+        Shader::Marks,
+        Shader::SweepCodes,
     ];
 
     fn composed(self) -> Composed {
@@ -67,7 +79,13 @@ impl Shader {
                 composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian_variance")
             }
             Shader::MapPool => composed!("common", "floats", "pairs", "cells", "entries", "map_pool"),
-            Shader::Finish => composed!("common", "floats", "pairs", "window_finish"),
+            Shader::Finish => composed!("common", "floats", "pairs", "estimators", "window_finish"),
+            Shader::Codes => composed!("common", "integers64", "double", "estimators", "window_codes"),
+            Shader::LevelPool => composed!("common", "integers64", "double", "entries", "level_cells", "level_pool"),
+            Shader::LevelWrite => composed!("common", "integers64", "double", "entries", "level_cells", "level_write"),
+            Shader::Point => composed!("common", "integers64", "double", "point"),
+            Shader::Marks => composed!("common", "marks"),
+            Shader::SweepCodes => composed!("common", "sweep_codes"),
         }
     }
 
@@ -89,17 +107,29 @@ impl Shader {
         match self {
             Shader::Obscurance => &["sweep"],
             Shader::Gradient => &["slopes"],
-            Shader::Finish => &["finish"],
+            Shader::Finish | Shader::Codes => &["finish"],
+            Shader::Point => &["point"],
+            Shader::Marks => &["look"],
+            Shader::SweepCodes => &["code"],
             _ => &["first", "next"],
         }
     }
 
-    /// Storage bindings after the uniform one: read, written, read, written, as many of them as the shader has.
+    /// Storage bindings after the uniform one.
     pub fn bindings(self) -> usize {
         match self {
+            Shader::Codes | Shader::Point => 5,
             Shader::Obscurance | Shader::Finish => 4,
-            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
+            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool | Shader::LevelPool => 3,
             _ => 2,
         }
     }
+
+    /// Whether a binding, counted from 1, is written: the second one, and the links of lines.
+    pub fn writes(self, binding: usize) -> bool {
+        binding == 2 || (binding == 4 && self == Shader::Obscurance)
+    }
 }
+
+/// Most storage bindings of a shader; every Vulkan adapter has more.
+pub const MOST_BINDINGS: u32 = 5;

@@ -2,7 +2,8 @@
 //! arithmetic, shared by planner and engine.
 
 use super::passes::{Part, largest, parts_within, stored};
-use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
+use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::recorder::{Planes, Recorder};
 use crate::grid::{DType, Shape};
 use crate::kernel::gradient::shared::{self, Along};
 use crate::stage::GradientWeight;
@@ -25,24 +26,21 @@ pub struct Slopes {
     pub vector: u32,
     pub threads: u32,
     pub table: u32,
+    pub stride: u32,
+    pub spare: [u32; 3],
 }
 
 /// Bits of a result that the device leaves to the CPU: a NaN that arithmetic does not make.
 pub const MARKED: u32 = u32::MAX;
 
-/// Words of the table of weights.
-pub const WEIGHTS: u64 = 81;
-
 /// Where a dispatch reads: a dense box whose rows are `pitch` voxels apart.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Input {
-    pub buffer: Buffer,
+    pub bind: Bind,
     pub size: Shape,
     pub pitch: usize,
     /// Centre of output 0.
     pub centre: [usize; 3],
-    /// Where the weights start in the tables.
-    pub table: u32,
 }
 
 /// Beyond this ratio of the components' weights, magnitudes are not made from what f32 keeps of the smallest.
@@ -110,22 +108,18 @@ impl SlopesJob {
         part.src[2].next_multiple_of(4 / self.voxel)
     }
 
-    pub(super) fn result_bytes(&self, dst: Shape) -> u64 {
-        dst.iter().map(|&n| n as u64).product::<u64>() * if self.vector { 12 } else { 4 }
+    /// Whether a window may be left to the CPU.
+    pub fn marks(&self) -> bool {
+        self.real || self.missing.is_some()
+    }
+
+    /// Planes that are made: components, or magnitudes.
+    pub fn planes(&self) -> usize {
+        if self.vector { 3 } else { 1 }
     }
 
     fn sizes(&self, part: &Part) -> Sizes {
-        let [nz, ny, _] = part.src;
-        Sizes {
-            params: PARAMS_STRIDE,
-            tables: rounded(4 * WEIGHTS),
-            source: rounded((nz * ny * self.pitch(part) * self.voxel) as u64),
-            a: rounded(self.result_bytes(part.dst)),
-            b: 0,
-            c: 0,
-            d: 0,
-            read: rounded(self.result_bytes(part.dst)),
-        }
+        self.record(part).sizes
     }
 
     /// Parts of which every buffer is at most `cap` bytes; `None` where even one voxel does not fit.
@@ -138,17 +132,24 @@ impl SlopesJob {
         largest(self.parts(cap), |p| self.sizes(p))
     }
 
+    /// The results of a part, and that they come back.
     pub fn record(&self, part: &Part) -> Recording {
         let centre = std::array::from_fn(|a| self.at[a] + part.lo[a] - part.from[a]);
-        let from = Input { buffer: Buffer::Source, size: part.src, pitch: self.pitch(part), centre, table: 0 };
-        let dispatch = self.dispatch(&from, part.dst, Buffer::A);
-        let back = Readback { from: Buffer::A, bytes: self.result_bytes(part.dst), to: 0 };
-        let commands = vec![Command::Dispatch(dispatch), Command::Readback(back)];
-        Recording { sizes: self.sizes(part), tables: self.table(), commands }
+        let pitch = self.pitch(part);
+        let mut recorder = Recorder::new((part.src[0] * part.src[1] * pitch * self.voxel) as u64);
+        let from = Input { bind: Buffer::Source.into(), size: part.src, pitch, centre };
+        let planes = self.results(&from, part.dst, &mut recorder);
+        let bytes = part.dst.iter().product::<usize>() as u64 * 4;
+        for c in 0..self.planes() {
+            recorder.read(planes.plane(c), bytes);
+        }
+        recorder.finish().expect("a gradient takes few buffers")
     }
 
-    pub(super) fn dispatch(&self, from: &Input, dst: Shape, to: Buffer) -> Dispatch {
+    /// One plane per component, or magnitudes, left on the device, to be multiplied by [`Self::scale`].
+    pub(super) fn results(&self, from: &Input, dst: Shape, to: &mut Recorder) -> Planes {
         let threads = dst.iter().product::<usize>() as u32;
+        let planes = Planes::take(to, threads as usize, self.planes());
         let slopes = Slopes {
             out: dst.map(|n| n as u32),
             plane: (from.size[1] * from.pitch) as u32,
@@ -163,19 +164,17 @@ impl SlopesJob {
             missing: self.missing.unwrap_or(0),
             vector: self.vector as u32,
             threads,
-            table: from.table,
+            table: to.table(self.table()),
+            stride: planes.stride,
+            spare: [0; 3],
         };
-        Dispatch {
-            shader: Shader::Gradient,
-            entry: 0,
-            params: bytemuck::bytes_of(&slopes).to_vec(),
-            bind: vec![from.buffer, to, Buffer::Tables],
-            threads,
-        }
+        let bind = [from.bind, planes.buffer.into(), Buffer::Tables.into()];
+        to.dispatch(Shader::Gradient, 0, &slopes, &bind, threads);
+        planes
     }
 
     /// Weights as the shader adds them up: mirrored voxels are added for every axis, also where both sides are one voxel.
-    pub(super) fn table(&self) -> Vec<u32> {
+    fn table(&self) -> Vec<u32> {
         let mut words = Vec::with_capacity(81);
         for (a, along) in self.along.iter().enumerate() {
             for (z, y, x) in (0..3).flat_map(|z| (0..3).flat_map(move |y| (0..3).map(move |x| (z, y, x)))) {

@@ -1,6 +1,6 @@
 //! The buffers of one brick on its way through the device: made once, grown when a larger brick comes, reused.
 
-use super::record::{Buffer, STAMP_BYTES, Sizes};
+use super::record::{Buffer, STAMP_BYTES, Sizes, WORK};
 
 /// Buffers with the bytes that they hold.
 #[derive(Default)]
@@ -10,10 +10,7 @@ pub struct Slot {
     pub params: Held,
     pub tables: Held,
     pub source: Held,
-    pub a: Held,
-    pub b: Held,
-    pub c: Held,
-    pub d: Held,
+    pub work: [Held; WORK],
     /// Device to host: results, then time stamps.
     pub read: Held,
 }
@@ -48,10 +45,9 @@ impl Slot {
         self.params.grow(device, "params", sizes.params, U::UNIFORM | U::COPY_DST);
         self.tables.grow(device, "tables", sizes.tables, U::STORAGE | U::COPY_DST);
         self.source.grow(device, "source", sizes.source, U::STORAGE | U::COPY_DST);
-        self.a.grow(device, "a", sizes.a, U::STORAGE | U::COPY_SRC);
-        self.b.grow(device, "b", sizes.b, U::STORAGE | U::COPY_SRC);
-        self.c.grow(device, "c", sizes.c, U::STORAGE | U::COPY_SRC);
-        self.d.grow(device, "d", sizes.d, U::STORAGE | U::COPY_SRC);
+        for (held, bytes) in self.work.iter_mut().zip(sizes.work) {
+            held.grow(device, "work", bytes, U::STORAGE | U::COPY_SRC | U::COPY_DST);
+        }
         self.read.grow(device, "read", sizes.read + STAMP_BYTES, U::MAP_READ | U::COPY_DST);
     }
 
@@ -59,10 +55,7 @@ impl Slot {
         match buffer {
             Buffer::Source => self.source.get(),
             Buffer::Tables => self.tables.get(),
-            Buffer::A => self.a.get(),
-            Buffer::B => self.b.get(),
-            Buffer::C => self.c.get(),
-            Buffer::D => self.d.get(),
+            Buffer::Work(i) => self.work[i as usize].get(),
         }
     }
 

@@ -1,8 +1,9 @@
 //! Obscurance: how a brick is cut into parts that fit the device, the tables of displacements and contributions, and one
 //! dispatch (or a few) per family of lines. Pure arithmetic, shared by planner and engine.
 
-use super::passes::cut;
-use super::record::{Buffer, Command, Dispatch, GROUP, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
+use super::passes::{Stored, cut};
+use super::record::{Bind, Buffer, GROUP, Recording, Shader, Sizes};
+use super::recorder::Recorder;
 use crate::grid::{DType, Region, Shape};
 use crate::kernel::obscurance::{Prepared, shared};
 
@@ -10,7 +11,7 @@ use crate::kernel::obscurance::{Prepared, shared};
 const NOT_SWEPT: u32 = u32::MAX;
 
 /// Cutting a brick repeats its halo. Beyond this many source voxels per voxel of the uncut box the CPU is the better place.
-const MOST_REPEATED: usize = 4;
+pub(super) const MOST_REPEATED: usize = 4;
 
 /// What one dispatch does; `struct Lines` of `shaders/obscurance.wgsl`, which explains the fields.
 #[repr(C)]
@@ -31,6 +32,27 @@ pub struct Lines {
     pub threads: u32,
     pub fresh: u32,
     pub spare: [u32; 4],
+}
+
+/// How voxels become codes; `struct Keys` of `shaders/sweep_codes.wgsl`, which explains the fields.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Keys {
+    pub threads: u32,
+    pub real: u32,
+    pub mask: u32,
+    pub flipped: u32,
+}
+
+impl Keys {
+    /// Of so many words of voxels stored so.
+    pub fn new(words: usize, stored: Stored, flipped: bool) -> Keys {
+        let bits = 8 * stored.voxel as u32;
+        let sign = if stored.signed { 1u32 << (bits - 1) } else { 0 };
+        let signs = (0..32 / bits).fold(0, |m, k| m | sign << (k * bits));
+        let mask = if flipped { !signs } else { signs };
+        Keys { threads: words as u32, real: stored.real as u32, mask, flipped: flipped as u32 }
+    }
 }
 
 /// One call: openness on `dst` of voxels that cover `src`, both in global indices.
@@ -91,27 +113,7 @@ impl<'a> SweepJob<'a> {
     }
 
     fn sizes(&self, part: &SweepPart, cap: u64) -> Option<Sizes> {
-        let [nz, ny, _] = part.src.shape();
-        let voxels = part.dst.voxels() as u64;
-        let (mut dispatches, mut words, mut links) = (0, 0, 0);
-        for family in self.sweep.lines() {
-            let (planes, lines) = extent(&self.family_box(part, &family), family.axis());
-            let batch = Self::batch(planes, lines, cap)?;
-            dispatches += lines.div_ceil(batch) as u64;
-            links = links.max((planes * batch * 4) as u64);
-            let reach = family.reach().min(planes - 1);
-            words += (2 * planes + 2 * (reach + 1)) as u64;
-        }
-        Some(Sizes {
-            params: rounded(dispatches * PARAMS_STRIDE),
-            tables: rounded(words * 4),
-            source: rounded((nz * ny * part.pitch(self.code) * self.code) as u64),
-            a: rounded(voxels * 4),
-            b: rounded(links),
-            c: 0,
-            d: 0,
-            read: rounded(voxels * 4),
-        })
+        self.recorded(part, cap).map(|r| r.sizes)
     }
 
     /// Largest buffers of any part.
@@ -120,29 +122,46 @@ impl<'a> SweepJob<'a> {
         parts.iter().filter_map(|p| self.sizes(p, cap)).fold(Sizes::default(), Sizes::max)
     }
 
-    /// All families over a part, then the sums. Panics for a part that [`Self::parts`] did not give for this `cap`.
+    /// All families over a part, and that the sums come back. Panics for a part that [`Self::parts`] did not give for this
+    /// `cap`.
     pub fn record(&self, part: &SweepPart, cap: u64) -> Recording {
-        let sizes = self.sizes(part, cap).expect("a part that fits");
-        let mut recording = Recording { sizes, ..Recording::default() };
-        for (number, family) in self.sweep.lines().enumerate() {
-            let lines = Lines { fresh: (number == 0) as u32, ..self.lines(part, &family, &mut recording.tables) };
+        self.recorded(part, cap).expect("a part that fits")
+    }
+
+    fn recorded(&self, part: &SweepPart, cap: u64) -> Option<Recording> {
+        let [nz, ny, _] = part.src.shape();
+        let mut recorder = Recorder::new((nz * ny * part.pitch(self.code) * self.code) as u64);
+        let sums = self.sums(part, Buffer::Source.into(), cap, &mut recorder)?;
+        recorder.read(sums.into(), part.dst.voxels() as u64 * 4);
+        recorder.finish()
+    }
+
+    /// Sums of contributions over a part, left on the device, from codes of all of its source. `None` where links do not stay
+    /// below `cap` bytes.
+    pub(super) fn sums(&self, part: &SweepPart, codes: Bind, cap: u64, to: &mut Recorder) -> Option<Buffer> {
+        let sums = to.take(part.dst.voxels() as u64 * 4);
+        let batches = self.sweep.lines().map(|family| {
+            let (planes, lines) = extent(&self.family_box(part, &family), family.axis());
+            Self::batch(planes, lines, cap).map(|batch| (batch, (planes * batch * 4) as u64))
+        });
+        let batches: Vec<(usize, u64)> = batches.collect::<Option<_>>()?;
+        let links = to.take(batches.iter().map(|b| b.1).max().unwrap_or(0));
+        for (number, (family, (batch, _))) in self.sweep.lines().zip(batches).enumerate() {
+            let mut tables = Vec::new();
+            let mut lines = Lines { fresh: (number == 0) as u32, ..self.lines(part, &family, &mut tables) };
+            let start = to.table(tables);
+            lines.shifts += start;
+            lines.tables = lines.tables.map(|t| if t == NOT_SWEPT { t } else { t + start });
             let all = (lines.size[0] * lines.size[1]) as usize;
-            let batch = Self::batch(lines.planes as usize, all, cap).expect("a part that fits");
             for first in (0..all).step_by(batch) {
                 let threads = batch.min(all - first) as u32;
                 let lines = Lines { first: first as u32, threads, ..lines };
-                recording.commands.push(Command::Dispatch(Dispatch {
-                    shader: Shader::Obscurance,
-                    entry: 0,
-                    params: bytemuck::bytes_of(&lines).to_vec(),
-                    bind: vec![Buffer::Source, Buffer::A, Buffer::Tables, Buffer::B],
-                    threads,
-                }));
+                let bind = [codes, sums.into(), Buffer::Tables.into(), links.into()];
+                to.dispatch(Shader::Obscurance, 0, &lines, &bind, threads);
             }
         }
-        let bytes = part.dst.voxels() as u64 * 4;
-        recording.commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to: 0 }));
-        recording
+        to.give(links);
+        Some(sums)
     }
 
     /// Parameters of one family; its displacements and contributions are put at the end of `tables`.

@@ -2,7 +2,8 @@
 //! axis of each. Pure arithmetic, shared by planner and engine.
 
 use super::passes::{Part, largest, packed, parts_within};
-use super::record::{Buffer, Command, Dispatch, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, rounded};
+use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::recorder::Recorder;
 use crate::grid::{DType, Shape};
 use crate::kernel::gaussian;
 
@@ -78,23 +79,8 @@ impl TapsJob {
         part.src[2].next_multiple_of(4 / self.voxel)
     }
 
-    pub(super) fn sizes(&self, part: &Part) -> Sizes {
-        let voxels = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
-        let words = |s: Shape| voxels(s) * if self.moments.variance { 12 } else { 4 };
-        let results = self.moments.mean as u64 + self.moments.variance as u64;
-        let ([nz, ny, _], [_, my, mx]) = (part.src, part.dst);
-        let dispatches = 3 * results;
-        let table: usize = (0..3).map(|a| part.dst[a] * (self.radius[a] + 1)).sum();
-        Sizes {
-            params: dispatches.max(1) * PARAMS_STRIDE,
-            tables: rounded(table as u64 * 4),
-            source: rounded((nz * ny * self.pitch(part) * self.voxel) as u64),
-            a: rounded(words([nz, ny, mx])),
-            b: rounded(words([nz, my, mx])),
-            c: 0,
-            d: 0,
-            read: results.max(1) * rounded(voxels(part.dst) * 4),
-        }
+    fn sizes(&self, part: &Part) -> Sizes {
+        self.record(part).sizes
     }
 
     /// Parts of which every buffer is at most `cap` bytes; `None` where even one voxel does not fit.
@@ -114,27 +100,23 @@ impl TapsJob {
         from..from + bytes
     }
 
-    /// x from packed voxels, then y, then z, as the CPU does it; the mean, then the variance.
+    /// The mean, then the variance, and that they come back.
     pub fn record(&self, part: &Part) -> Recording {
-        let mut recording = Recording { sizes: self.sizes(part), ..Recording::default() };
-        let starts = self.tables(part, &mut recording.tables);
-        for (shader, wanted) in [(MEAN, self.moments.mean), (VARIANCE, self.moments.variance)] {
-            if wanted {
-                self.passes(part, shader, starts, Buffer::A, &mut recording.commands);
-                let place = self.place(part, shader == VARIANCE);
-                let (bytes, to) = (place.len() as u64, place.start as u64);
-                recording.commands.push(Command::Readback(Readback { from: Buffer::A, bytes, to }));
-            }
+        let mut recorder = Recorder::new((part.src[0] * part.src[1] * self.pitch(part) * self.voxel) as u64);
+        for made in self.results(part, Buffer::Source.into(), &mut recorder).into_iter().flatten() {
+            recorder.read(made.into(), self.place(part, false).len() as u64);
         }
-        recording
+        recorder.finish().expect("a Gaussian takes few buffers")
     }
 
-    /// The mean alone, left on the device in `to`.
-    pub(super) fn record_into(&self, part: &Part, to: Buffer) -> Recording {
-        let mut recording = Recording { sizes: self.sizes(part), ..Recording::default() };
-        let starts = self.tables(part, &mut recording.tables);
-        self.passes(part, MEAN, starts, to, &mut recording.commands);
-        recording
+    /// Mean and variance, where they are wanted, left on the device.
+    pub(super) fn results(&self, part: &Part, from: Bind, to: &mut Recorder) -> [Option<Buffer>; 2] {
+        let mut tables = Vec::new();
+        let mut starts = self.tables(part, &mut tables);
+        let first = to.table(tables);
+        starts.iter_mut().flatten().for_each(|s| *s += first);
+        [(MEAN, self.moments.mean, 4), (VARIANCE, self.moments.variance, 12)]
+            .map(|(shader, wanted, cell)| wanted.then(|| self.passes(part, shader, starts, cell, from, to)))
     }
 
     /// Weights of every axis and of its centres, for each output along it, and where they start.
@@ -152,7 +134,20 @@ impl TapsJob {
         })
     }
 
-    fn passes(&self, part: &Part, shader: Shader, starts: [[u32; 2]; 3], last: Buffer, commands: &mut Vec<Command>) {
+    /// x from packed voxels, then y, then z, as the CPU does it, over cells of so many bytes.
+    fn passes(
+        &self,
+        part: &Part,
+        shader: Shader,
+        starts: [[u32; 2]; 3],
+        cell: u64,
+        from: Bind,
+        to: &mut Recorder,
+    ) -> Buffer {
+        let bytes = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>() * cell;
+        let ([nz, ny, _], [_, my, mx]) = (part.src, part.dst);
+        let last = to.take(part.dst.iter().map(|&n| n as u64).product::<u64>() * 4);
+        let [a, b] = [[nz, ny, mx], [nz, my, mx]].map(|s| to.take(bytes(s)));
         let pitch = self.pitch(part);
         let mut strides = [part.src[1] * pitch, pitch, 1];
         let mut extent = part.src;
@@ -180,16 +175,14 @@ impl TapsJob {
                 last: (axis == 0) as u32,
                 ..Taps::default()
             };
-            let [input, output] = [[Buffer::B, last], [Buffer::A, Buffer::B], [Buffer::Source, Buffer::A]][axis];
-            commands.push(Command::Dispatch(Dispatch {
-                shader,
-                entry,
-                params: bytemuck::bytes_of(&taps).to_vec(),
-                bind: vec![input, output, Buffer::Tables],
-                threads: taps.threads,
-            }));
+            let input = [Bind::from(b), a.into(), from][axis];
+            let bind = [input, [last, b, a][axis].into(), Buffer::Tables.into()];
+            to.dispatch(shader, entry, &taps, &bind, taps.threads);
             strides = next;
         }
+        to.give(a);
+        to.give(b);
+        last
     }
 }
 

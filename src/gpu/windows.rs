@@ -1,21 +1,20 @@
-//! Box statistics and estimators on the device: exact sums and extremes, or moments of f32, there; the CPU's row functions
-//! here.
+//! Box statistics and estimators on the device: exact sums and extremes, or moments of f32, and the results that they give.
 
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::facts;
 use super::float_windows;
-use super::passes::{Job, Part, Quantity, result_bytes};
+use super::passes::{Job, Part};
 use crate::grid::{AnyView, DType, View, Voxel};
 use crate::kernel::Context;
-use crate::kernel::window::finish::{Sums, Windows, finish};
 use crate::kernel::window::{self, Needs, Place, WindowOut};
-use crate::stage::WindowParams;
+use crate::stage::{WindowChannel, WindowParams};
 
 impl Gpu {
-    /// The same as [`window::window`] for inputs that [`facts::window`] admits: of integers bit for bit, of f32 within
-    /// [`facts::tolerance`], on an adapter with exact floats. `voxel` is the first output voxel's place in the volume.
-    /// Windows too large for the device even one voxel at a time are computed by the CPU kernel. After a failure the device
-    /// is opened anew and the call tried once more.
+    /// The same as [`window::window`] for inputs that [`facts::window`] admits: statistics of integers bit for bit, openness
+    /// and windows of f32 within [`facts::tolerance`], the latter on an adapter with exact floats. `voxel` is the first output
+    /// voxel's place in the volume. Windows too large for the device even one voxel at a time ([`Job::fits`]), and openness
+    /// that is asked for as codes, are made by the CPU kernel. After a failure the device is opened anew and the call tried
+    /// once more.
     ///
     /// Panics where [`window::window`] does.
     ///
@@ -39,13 +38,15 @@ impl Gpu {
             return Ok(Times::default());
         }
         let needs = Needs::of(channels.iter().copied(), src.dtype().is_float());
+        let real = src.dtype() == DType::F32;
+        // The shaders write f32, in which extremes of small integers have room.
+        let coded = |o: &WindowOut| matches!(o.channel, WindowChannel::Openness(..)) && o.dst.dtype() == DType::U8;
         let job = Job::new(src.dtype(), src.shape(), dst, at, params.radius, needs).map(|j| {
-            // The shader writes f32.
-            let wide = outs.iter().any(|o| o.dst.dtype() != DType::F32);
-            if wide { j.placed(voxel) } else { j.placed(voxel).finished(params, &channels) }
+            let made = if real && outs.iter().any(coded) { j } else { j.finished(params, &channels) };
+            made.placed(voxel)
         });
+        let job = job.filter(|j| real || j.finish.is_some() && !outs.iter().any(coded));
         let Some((job, parts)) = job.and_then(|j| Some((j, j.parts(self.cap())?))) else {
-            // Integers are exact, and that a window of floats is too large depends on its radius and the volume alone.
             window::window(src, params, Place::new(at, voxel), outs, cx);
             return Ok(Times::default());
         };
@@ -59,8 +60,7 @@ impl Gpu {
                     if let AnyView::F32(v) = src {
                         return float_windows::finish(&job, part, bytes, v, params, outs, cx);
                     }
-                    let windows = windows(bytes, part, &job.quantities())?;
-                    finish(src, params, job.at, outs, &windows, cx);
+                    float_windows::store_all(cast(bytes)?, part, outs);
                     Ok(())
                 };
                 run_part(device, &recording, &mut fill, &mut done, &mut times)?;
@@ -97,24 +97,4 @@ pub(super) fn pack(src: AnyView, part: &Part, pitch: usize, out: &mut wgpu::Writ
 /// Mapped bytes as what the device wrote.
 pub(super) fn cast<T: bytemuck::Pod>(bytes: &[u8]) -> Result<&[T], GpuError> {
     bytemuck::try_cast_slice(bytes).map_err(|e| GpuError(format!("results are not aligned: {e}")))
-}
-
-/// The mapped results of a part by quantity.
-fn windows<'a>(bytes: &'a [u8], part: &Part, quantities: &[Quantity]) -> Result<Windows<'a>, GpuError> {
-    let mut out = Windows { lo: part.lo, shape: part.dst, extremes: &[], s1: Sums::None, s2: Sums::None };
-    let mut place = 0;
-    for &quantity in quantities {
-        let len = result_bytes(part, quantity) as usize;
-        let slice = &bytes[place..place + len];
-        match quantity {
-            Quantity::Extremes => out.extremes = cast(slice)?,
-            Quantity::Sum { square, wide } => {
-                let sums = if wide { Sums::Wide(cast(slice)?) } else { Sums::Narrow(cast(slice)?) };
-                *(if square { &mut out.s2 } else { &mut out.s1 }) = sums;
-            }
-            Quantity::Order | Quantity::Moments { .. } => unreachable!("integers have sums"),
-        }
-        place += len.next_multiple_of(256);
-    }
-    Ok(out)
 }

@@ -52,20 +52,21 @@ pub fn convert_row<S: Voxel, D: Output>(level: Level, src: &[S], mapping: Mappin
 /// value half way between two codes goes where anyone who recomputes it puts it. (A single factor `top / width` moved 45
 /// of [0, 50] from 229.5 to just below.)
 #[derive(Debug, Clone, Copy)]
-struct Linear {
+pub struct Linear {
     /// 0.5 where `hi - lo` would overflow, else 1.
-    half: f64,
-    lo: f64,
-    width: f64,
-    top: f64,
-    low: f64,
-    high: f64,
+    pub half: f64,
+    pub lo: f64,
+    pub width: f64,
+    pub top: f64,
+    pub low: f64,
+    pub high: f64,
     /// What NaN becomes, inside the type's range.
-    fill: f64,
+    pub fill: f64,
 }
 
 impl Linear {
-    fn new(mapping: Mapping, dtype: DType) -> Linear {
+    /// Of a type of integers.
+    pub fn new(mapping: Mapping, dtype: DType) -> Linear {
         let (least, high) = dtype.range();
         let fill = if mapping.fill.is_nan() { 0.0 } else { mapping.fill.clamp(least, high) };
         match mapping.range {

@@ -5,10 +5,10 @@ use std::fmt::Write;
 use serde_json::{Value, json};
 
 use super::brick::mib;
-use super::graph::{Producer, Step};
+use super::graph::{Producer, Step, StepId};
 use super::skips::{self, Known};
 use super::tasks::input_halo;
-use super::{Group, Plan};
+use super::{FlowPlan, Group, Plan, flows};
 use crate::Result;
 use crate::config::Config;
 use crate::grid::Region;
@@ -44,8 +44,8 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
         let (_, device, reason) = &plan.placement[s];
         let _ = writeln!(w, "step {s}: {} -> {} on {device} ({reason})", reads(plan, step), makes(plan, step));
         let _ = writeln!(w, "  {}, reach {:?}, halo beyond the brick {:?}", step.kind.name(), step.reach, step.halo);
-        if let Some(reader) = plan.chains[s] {
-            let _ = writeln!(w, "  its results stay on the GPU for step {reader}");
+        if let Some(flow) = plan.flow_of(s) {
+            let _ = writeln!(w, "  {}", flow_text(plan, &plan.flows[flow], s));
         }
         if plan.shares(s) {
             let _ = writeln!(w, "  CPU workers take bricks too while the GPU's slots are taken");
@@ -152,6 +152,18 @@ fn skips_text(w: &mut String, group: &Group, known: Option<&Known>) {
     }
 }
 
+/// With which steps one runs on the GPU, and what of it comes back.
+fn flow_text(plan: &Plan, flow: &FlowPlan, step: StepId) -> String {
+    let others: Vec<String> = flow.steps.iter().filter(|s| **s != step).map(ToString::to_string).collect();
+    let with = if others.is_empty() { String::new() } else { format!(" with step {}", others.join(", ")) };
+    let back: Vec<&str> = (plan.graph.steps[step].outputs.iter())
+        .filter(|w| plan.groups.iter().any(|g| flows::voxels_come_back(plan, flow, g, **w)))
+        .map(|w| plan.graph.wires[*w].name.as_str())
+        .collect();
+    let what = if back.is_empty() { "no voxels of it, only outputs' levels".into() } else { back.join(", ") };
+    format!("on the GPU in one go{with}; comes back: {what}")
+}
+
 fn skips_json(group: &Group, known: Option<&Known>) -> Value {
     let outside = outside(group);
     let Some(k) = known else { return json!({ "share": null, "outside_region": outside }) };
@@ -229,12 +241,12 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         .steps
         .iter()
         .zip(&plan.placement)
-        .zip(&plan.chains)
-        .map(|((step, (_, device, reason)), chain)| {
+        .enumerate()
+        .map(|(s, (step, (_, device, reason)))| {
             json!({
                 "stages": step.stages, "kernel": step.kind.name(), "reads": reads(plan, step), "makes": makes(plan, step),
                 "reach": step.reach, "halo": step.halo, "streamed": step.streamed, "device": device, "reason": reason,
-                "stays_on_gpu_for_step": chain,
+                "gpu_flow": plan.flow_of(s),
             })
         })
         .collect();

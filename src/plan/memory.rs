@@ -2,7 +2,7 @@
 
 use super::graph::{GradientChannel, Moment, Step, StepId, StepKind, WireId};
 use super::tasks::{Group, input_halo};
-use super::{OutputPlan, Plan, chains};
+use super::{OutputPlan, Plan, flows};
 use crate::gpu::{facts, passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, levels, moments4, obscurance, rank, reduce, window};
@@ -36,9 +36,11 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
         };
         let outputs = of(s);
         peak = peak.max(sum(&live) + sum(&outputs));
-        if let Some(reader) = plan.chains[s] {
-            // Its reader's results are made with it, unless the two must run one by one.
-            peak = peak.max(sum(&live) + sum(&of(reader)));
+        if let Some(flow) = plan.flows.iter().find(|f| f.first(&group.steps) == Some(s)) {
+            // All that comes back is made at once, unless the steps must run one by one.
+            let back = flow.steps.iter().flat_map(|&t| of(t));
+            let back = back.filter(|(w, _)| flows::voxels_come_back(plan, flow, group, *w));
+            peak = peak.max(sum(&live) + back.map(|b| b.1).sum::<u64>() + level_bytes(plan, group, flow, shape));
         }
         live.extend(outputs);
         let last_use = |w: WireId| {
@@ -140,16 +142,12 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
     let Some(gpu) = &plan.gpu else { return 0 };
     let cap = gpu.buffer_cap(plan.memory);
     let steps = group.steps.iter().filter(|&&s| plan.on_gpu(s));
-    let sizes = steps.map(|&s| {
-        let step = &plan.graph.steps[s];
-        let chained = plan.chains[s].map_or(record::Sizes::default(), |t| {
-            let reader = &plan.graph.steps[t];
-            let dst = grown(group.brick.shape, reader.halo, group.shape);
-            let extents = chains::extents(step, reader, dst, group.shape);
-            let job = chains::job(step, reader, plan.graph.wires[step.inputs[0]].dtype, &extents);
-            job.map_or(record::Sizes::default(), |j| j.slot(cap))
-        });
-        slot_sizes(plan, group, step, cap).max(chained)
+    let sizes = steps.map(|&s| slot_sizes(plan, group, &plan.graph.steps[s], cap));
+    let flows = plan.flows.iter().filter_map(|f| {
+        let brick = inner(group.region, group.brick.shape, group.align);
+        let (steps, outputs) = (&group.steps[..], &group.outputs[..]);
+        let site = flows::Site { steps, outputs, volume: group.shape, brick, globals: &[] };
+        Some(flows::build(plan, f, &site)?.0.slot(cap))
     });
     let maps = group.outputs.iter().filter(|&&o| plan.map_on_gpu(o)).filter_map(|&o| {
         // A brick in the middle of the map, where it sees most.
@@ -160,7 +158,31 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
         let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + group.brick.shape[a] as i64));
         Some(job.slot(brick.clip(&Region::whole(shape)), cap))
     });
-    facts::SLOTS * sizes.chain(maps).fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
+    facts::SLOTS
+        * sizes.chain(maps).chain(flows).fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
+}
+
+/// A brick in the middle of a region, where it sees most.
+fn inner(region: Region, brick: Shape, align: Shape) -> Region {
+    let n = region.shape();
+    let lo: [i64; 3] = std::array::from_fn(|a| {
+        let before = n[a].saturating_sub(brick[a]) / 2;
+        region.lo[a] + (before / align[a] * align[a]) as i64
+    });
+    Region::new(lo, std::array::from_fn(|a| lo[a] + brick[a] as i64)).clip(&region)
+}
+
+/// Levels and cells of the outputs that a flow makes, all components at once.
+fn level_bytes(plan: &Plan, group: &Group, flow: &flows::FlowPlan, brick: Shape) -> u64 {
+    let voxels = brick.iter().map(|&n| n as u64).product::<u64>();
+    let made = |w: WireId| flow.steps.iter().any(|&s| plan.graph.steps[s].outputs.contains(&w));
+    let of = |o: &OutputPlan| {
+        let parts = o.parts.iter().filter(|p| made(p.0)).count() as u64;
+        // Every level halves at least one axis.
+        let levels = if o.level_count() > 1 { 2 } else { 1 };
+        parts * voxels * (levels * o.spec.dtype.size() as u64 + reduce::bytes_per_cell(o.reduce) as u64 / 8)
+    };
+    group.outputs.iter().map(|&o| of(&plan.outputs[o])).sum()
 }
 
 /// Largest buffers that a step needs on the GPU.

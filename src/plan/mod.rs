@@ -2,8 +2,8 @@
 //! indices, printable, without threads, buffers or files.
 
 pub mod brick;
-pub mod chains;
 pub mod explain;
+pub mod flows;
 pub mod graph;
 pub mod lengths;
 pub mod lower;
@@ -17,12 +17,16 @@ use graph::{GlobalId, Graph, StepId, WireId};
 
 pub use brick::BrickChoice;
 pub use explain::explain;
+pub use flows::FlowPlan;
 pub use outputs::{MapPlan, OutputPlan};
 pub use tasks::{Group, Task};
 
 use crate::config::{Config, Device, Lanes};
+use crate::gpu::passes::Job;
 use crate::gpu::{GpuFacts, facts};
 use crate::grid::Border;
+use crate::kernel::window::Needs;
+use crate::stage::WindowChannel;
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 
@@ -68,8 +72,8 @@ pub struct Plan {
     pub placement: Placement,
     /// The adapter that the steps placed on "gpu" run on.
     pub gpu: Option<GpuFacts>,
-    /// By step: the step for which its results stay on the GPU.
-    pub chains: Vec<Option<StepId>>,
+    /// Steps that run on the GPU together.
+    pub flows: Vec<FlowPlan>,
 }
 
 impl Plan {
@@ -83,7 +87,8 @@ impl Plan {
             n => n,
         };
         let graph = lowered.graph;
-        let (placement, gpu) = placement(config, &graph, &outputs, find_gpu)?;
+        let (mut placement, gpu) = placement(config, &graph, &outputs, find_gpu)?;
+        let flows = join_flows(&graph, &mut placement);
         let warnings = warnings(&graph);
         let mut plan = Plan {
             groups: Vec::new(),
@@ -98,7 +103,7 @@ impl Plan {
             warnings,
             placement,
             gpu,
-            chains: Vec::new(),
+            flows,
         };
         if plan.waives_byte_identity() {
             plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
@@ -162,6 +167,11 @@ impl Plan {
         self.lanes == Lanes::Mixed && (0..steps.len()).any(|s| self.on_gpu(s) && floats(&self.graph, &steps[s]))
     }
 
+    /// The flow that a step belongs to.
+    pub fn flow_of(&self, step: StepId) -> Option<usize> {
+        self.flows.iter().position(|f| f.steps.contains(&step))
+    }
+
     /// Tasks of all groups; their numbers are dense.
     pub fn task_count(&self) -> usize {
         self.groups.iter().map(|g| g.task_count()).sum()
@@ -192,7 +202,7 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
         }
         graph::StepKind::Levels { .. } => return Err(facts::LEVELS),
         graph::StepKind::Moments4 { .. } => return Err(facts::MOMENTS4),
-        _ => return Err("no GPU kernel for this kind of stage: runs on the CPU"),
+        _ => return Err(flows::ALONE),
     };
     if matches!(step.border, Border::Constant(_)) && input.beyond(step.border).1 {
         return Err(
@@ -207,9 +217,27 @@ fn gpu_kernel(step: &graph::Step, input: &graph::Wire) -> Result<(), &'static st
     }
 }
 
-/// Whether a step on the GPU makes floats there.
+/// The flows of a graph; steps that look at one voxel go where they are part of one.
+fn join_flows(graph: &Graph, placement: &mut Placement) -> Vec<FlowPlan> {
+    let on_gpu: Vec<bool> = placement[..graph.steps.len()].iter().map(|p| p.1 == "gpu").collect();
+    let flows = flows::find(graph, &on_gpu);
+    for &s in flows.iter().flat_map(|f| &f.steps) {
+        if placement[s].1 != "gpu" {
+            (placement[s].1, placement[s].2) = ("gpu", flows::BESIDE.to_string());
+        }
+    }
+    flows
+}
+
+/// Whether a step on the GPU makes floats there that are not the CPU's bit for bit.
 fn floats(graph: &Graph, step: &graph::Step) -> bool {
-    exact(graph, step) || matches!(step.kind, graph::StepKind::Gradient { .. })
+    let open = |c: &WindowChannel| matches!(c, WindowChannel::Openness(..));
+    exact(graph, step)
+        || match &step.kind {
+            graph::StepKind::Gradient { .. } => true,
+            graph::StepKind::Window { channels, .. } => channels.iter().any(open),
+            _ => false,
+        }
 }
 
 /// Whether a step needs [`GpuFacts::exact_floats`].
@@ -228,15 +256,15 @@ fn placement(
     outputs: &[OutputPlan],
     find: FindGpu,
 ) -> Result<(Placement, Option<GpuFacts>)> {
-    // Name, whether there is a kernel, whether it asks for exact floats, and an occlusion map's output.
+    // Name, whether there is a kernel, whether it asks for exact floats, and what it is.
     let steps = graph.steps.iter().map(|s| {
         let kernel = gpu_kernel(s, &graph.wires[s.inputs[0]]);
-        (s.stages.join("+"), kernel, exact(graph, s), None)
+        (s.stages.join("+"), kernel, exact(graph, s), Work::Step(s))
     });
     let maps = outputs.iter().filter_map(|o| o.map.as_ref().map(|m| (o, m))).map(|(o, m)| {
         let wire = &graph.wires[m.source];
         let kernel = facts::occlusion_map(wire.dtype, wire.missing.is_some());
-        (config.outputs[o.index].from[0].name.clone(), kernel, true, Some(o))
+        (config.outputs[o.index].from[0].name.clone(), kernel, true, Work::Map(o))
     });
     let work: Vec<_> = steps.chain(maps).collect();
     let any = work.iter().any(|w| w.1.is_ok());
@@ -245,21 +273,21 @@ fn placement(
         Device::Auto => any.then(find),
         Device::Gpu | Device::GpuSoftware => Some(Ok(find().map_err(|why| no_such_gpu(config, &why))?)),
     };
-    let place = |kernel: Result<(), &'static str>, exact: bool, map: Option<&OutputPlan>| match (&found, kernel) {
+    let place = |kernel: Result<(), &'static str>, exact: bool, of: Work| match (&found, kernel) {
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
         (Some(Ok(gpu)), Ok(())) if exact && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
-        (Some(Ok(gpu)), Ok(())) if map.is_some_and(|o| !map_fits(graph, o, gpu.buffer_cap(config.run.memory))) => {
-            ("cpu", facts::MAP_TOO_LARGE.to_string())
-        }
-        (Some(Ok(gpu)), Ok(())) => ("gpu", gpu.name.clone()),
+        (Some(Ok(gpu)), Ok(())) => match of.too_large(graph, gpu.buffer_cap(config.run.memory)) {
+            Some(why) => ("cpu", why.to_string()),
+            None => ("gpu", gpu.name.clone()),
+        },
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),
     };
     let places: Placement = work
         .into_iter()
-        .map(|(name, kernel, exact, map)| {
-            let (device, reason) = place(kernel, exact, map);
+        .map(|(name, kernel, exact, of)| {
+            let (device, reason) = place(kernel, exact, of);
             (name, device, reason)
         })
         .collect();
@@ -267,8 +295,32 @@ fn placement(
     Ok((places, found.and_then(|f| f.ok()).filter(|_| used)))
 }
 
-fn map_fits(graph: &Graph, output: &OutputPlan, cap: u64) -> bool {
-    output.map_job(graph).is_some_and(|job| job.fits(cap))
+/// What is placed.
+#[derive(Clone, Copy)]
+enum Work<'a> {
+    Step(&'a graph::Step),
+    Map(&'a OutputPlan),
+}
+
+impl Work<'_> {
+    /// Why it stays on the CPU, where not even one voxel of it fits the device's buffers: floats must be one lane's.
+    fn too_large(self, graph: &Graph, cap: u64) -> Option<&'static str> {
+        match self {
+            Work::Map(output) => {
+                let fits = output.map_job(graph).is_some_and(|job| job.fits(cap));
+                (!fits).then_some(facts::MAP_TOO_LARGE)
+            }
+            Work::Step(step) => {
+                let graph::StepKind::Window { params, channels } = &step.kind else { return None };
+                let wire = &graph.wires[step.inputs[0]];
+                let volume = graph.lattices[wire.lattice].shape;
+                let needs = Needs::of(channels.iter().copied(), wire.dtype.is_float());
+                let job = Job::new(wire.dtype, volume, volume, [0; 3], params.radius, needs);
+                let fits = job.is_some_and(|job| job.finished(params, channels).fits(volume, cap));
+                (!fits).then_some(facts::WINDOW_TOO_LARGE)
+            }
+        }
+    }
 }
 
 /// A GPU that was demanded and is not there: the file and line that ask for it, what was found, what would be accepted. The

@@ -3,7 +3,7 @@
 //! itself, which takes more reading and a fraction of the memory. The bits are the same, so that a resumed run may change it.
 
 use super::graph::{ObscuranceChannel, Producer, StepId, StepKind};
-use super::{Group, Plan, brick, chains, tasks};
+use super::{Group, Plan, brick, tasks};
 use crate::Result;
 use crate::config::Config;
 use crate::grid::{Region, Shape};
@@ -40,14 +40,12 @@ pub fn choose(plan: &mut Plan, config: &Config) -> Result<()> {
     }
     stream(plan, &steps, false);
     plan.groups = groups;
-    plan.chains = chains::chains(plan);
     whole.map(|_| ())
 }
 
 /// Groups and bricks of the graph as it is, and the relative time of the whole run.
 fn bricks(plan: &mut Plan, config: &Config) -> Result<f64> {
     plan.groups = tasks::groups(plan);
-    plan.chains = chains::chains(plan);
     let mut time = 0.0;
     for g in 0..plan.groups.len() {
         let (choice, cost) = brick::choose(plan, &plan.groups[g], config)?;

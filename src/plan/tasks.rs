@@ -112,6 +112,18 @@ impl OutputPlan {
         MapJob::new(graph.wires[map.source].dtype, levels.collect())
     }
 
+    /// The values that map to 0 and the largest code, from the config or a pre-pass.
+    pub fn mapped(&self, globals: &[Vec<f64>]) -> Option<[f64; 2]> {
+        let Some(id) = self.auto_range else { return self.range };
+        let [lo, hi] = Plan::global(globals, id);
+        let usable = lo.is_finite() && hi.is_finite();
+        Some(match usable {
+            false => [0.0, 1.0],
+            true if hi > lo => [lo, hi],
+            true => [lo, lo + 1.0],
+        })
+    }
+
     /// The last level that bricks make by themselves.
     pub fn brick_level(&self) -> usize {
         (self.level_count() - 1).min(BRICK_LEVELS)

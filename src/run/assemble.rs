@@ -6,6 +6,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::compute::Finished;
+use super::flows::Ready;
 use super::maps;
 use super::steps::MaskValue;
 use super::value::{Comp, Value};
@@ -111,6 +112,10 @@ impl Assembler<'_> {
             }
             for (component, &(wire, comp)) in output.parts.iter().enumerate() {
                 let place = Place { index, output, target, component, slot };
+                if let Some(ready) = done.ready(index, component) {
+                    self.ready(&place, ready, done.brick, &mut items)?;
+                    continue;
+                }
                 self.component(&place, wire, comp, done, scratch, &mut items)?;
             }
         }
@@ -149,6 +154,26 @@ impl Assembler<'_> {
         Ok(())
     }
 
+    /// Levels that were made where the voxels were.
+    fn ready(&self, place: &Place, ready: &Ready, brick: Region, items: &mut Vec<Item>) -> Result<()> {
+        for (k, voxels) in ready.levels.iter().enumerate() {
+            let region = place.output.level_box(k, brick);
+            self.put(place, k, region, voxels.view(region.shape()), items)?;
+        }
+        self.spill(place, brick, &ready.cells);
+        Ok(())
+    }
+
+    /// Keeps the numbers of cells for the levels beyond.
+    fn spill(&self, place: &Place, brick: Region, numbers: &[f64]) {
+        let Some(spill) = &place.target.cells else { return };
+        let k = place.output.brick_level();
+        let region = place.output.level_box(k, brick);
+        for (p, plane) in numbers.chunks_exact(region.voxels()).enumerate() {
+            spill.write(place.component * planes(place.output.reduce) + p, region, as_bytes(plane));
+        }
+    }
+
     /// Levels 1 to the last that bricks make; cells of that one are kept for the levels beyond.
     fn levels(
         &self,
@@ -174,18 +199,10 @@ impl Assembler<'_> {
             self.put(place, k, output.level_box(k, brick), rounded.view(cells.shape), items)?;
             self.pool.put(rounded);
         }
-        if let Some(spill) = &place.target.cells {
-            let k = output.brick_level();
-            let region = output.level_box(k, brick);
-            if k == 0 {
-                unreachable!("a second phase needs at least one level made by bricks");
-            }
+        if place.target.cells.is_some() {
             let mut data = Vec::new();
             cells.store(&mut data);
-            let n = cells.value.len();
-            for (p, plane) in data.chunks_exact(n).enumerate() {
-                spill.write(place.component * planes(output.reduce) + p, region, as_bytes(plane));
-            }
+            self.spill(place, brick, &data);
         }
         Ok(())
     }
@@ -229,7 +246,7 @@ impl Assembler<'_> {
     }
 
     /// Hands voxels of the output's type to their chunks: whole ones are encoded at once, parts wait for the rest.
-    fn put(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
+    pub fn put(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
         let (output, sink) = (place.output, &place.target.sink);
         let dataset = k - output.first_level();
         let mut push = |region: Region, chunk: Encoded| {

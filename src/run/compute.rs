@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::time::Instant;
 
+use super::flows::Ready;
 use super::program::Program;
 use super::read::{Loaded, Reader};
 use super::steps::{Engine, MaskValue};
@@ -20,11 +21,18 @@ pub struct Finished {
     /// By wire; only sinks remain.
     pub values: Vec<Option<Value>>,
     pub masks: Vec<(StepId, MaskValue)>,
+    /// Levels that are made already.
+    pub ready: Vec<Ready>,
 }
 
 impl Finished {
     pub fn value(&self, wire: WireId) -> &Value {
         self.values[wire].as_ref().expect("every sink is delivered")
+    }
+
+    /// The levels of a component of an output, where they are made already.
+    pub fn ready(&self, output: usize, component: usize) -> Option<&Ready> {
+        self.ready.iter().find(|r| (r.output, r.component) == (output, component))
     }
 
     /// The mask of the step that made a wire, over that step's box.
@@ -51,22 +59,30 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
         masks.iter().filter(|(_, m)| matches!(m, MaskValue::None) && engine.skip).map(|(s, _)| *s).collect();
     let needed = program.needed(plan, &off);
     let (mut masked, mut constant, mut ran) = (false, false, false);
-    let mut made = Vec::new();
+    let (mut made, mut ready) = (Vec::new(), Vec::new());
     for (at, &s) in program.steps.iter().enumerate() {
         let step = &plan.graph.steps[s];
-        if !step.outputs.iter().any(|&w| needed[w]) || made.contains(&s) {
+        if made.contains(&s) {
+            release(engine, program, at, &mut values);
             continue;
         }
-        if let Some(reader) = plan.chains[s].filter(|&t| program.steps.contains(&t) && !off.contains(&t)) {
-            let boxes = [s, reader].map(|s| program.step_box(plan, s, brick));
+        if !step.outputs.iter().any(|&w| needed[w]) {
+            continue;
+        }
+        if let Some(flow) = program.flow_at(s) {
             let start = Instant::now();
-            if let Some(outputs) = engine.chained([s, reader], &mut values, boxes, volume)? {
+            if let Some(done) = engine.flow(program, flow, &mut values, brick)? {
                 ran = true;
-                made.push(reader);
-                metrics.step(s, start, boxes[0].voxels() as u64);
-                metrics.step(reader, Instant::now(), boxes[1].voxels() as u64);
-                trace.span(&plan.graph.steps[reader].stages.join("+"), start, &[("brick", format!("{brick:?}"))]);
-                keep(engine, program, &plan.graph.steps[reader], outputs, &needed, at, &mut values);
+                made.extend(flow.steps.iter().copied());
+                for (k, &t) in flow.steps.iter().enumerate() {
+                    let voxels = program.step_box(plan, t, brick).voxels() as u64;
+                    metrics.step(t, if k == 0 { start } else { Instant::now() }, voxels);
+                }
+                let names: Vec<String> = flow.steps.iter().flat_map(|t| plan.graph.steps[*t].stages.clone()).collect();
+                trace.span(&names.join("+"), start, &[("brick", format!("{brick:?}"))]);
+                ready.extend(done.ready);
+                done.values.into_iter().for_each(|(w, value)| values[w] = Some(value));
+                release(engine, program, at, &mut values);
                 continue;
             }
         }
@@ -104,7 +120,7 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
         (false, false, true) => metrics.skipped("constant"),
         _ => metrics.computed(),
     }
-    Ok(Finished { brick, values, masks })
+    Ok(Finished { brick, values, masks, ready })
 }
 
 /// Keeps what a step made and somebody needs, and gives back what nobody reads after the step at position `at`.
@@ -124,6 +140,11 @@ fn keep(
             value.recycle(engine.pool);
         }
     }
+    release(engine, program, at, values);
+}
+
+/// Gives back what nobody reads after the step at position `at`.
+fn release(engine: &Engine, program: &Program, at: usize, values: &mut [Option<Value>]) {
     for (w, value) in values.iter_mut().enumerate() {
         if value.is_some() && !program.wanted_after(engine.plan, at, w) {
             value.take().into_iter().for_each(|v| v.recycle(engine.pool));

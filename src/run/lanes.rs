@@ -3,15 +3,12 @@
 use super::steps::{Engine, Fetch, MaskValue, three, view_mut, views_mut};
 use super::value::{Value, common_value};
 use crate::brick::Scratch;
-use crate::gpu::chain::Extents;
-use crate::gpu::slopes::Fit;
 use crate::gpu::{Gpu, GpuError};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
 use crate::kernel::gradient::GradientOut;
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
-use crate::kernel::window::WindowOut;
 use crate::kernel::{Context, pointwise};
-use crate::plan::graph::{GradientChannel, ObscuranceChannel, StepId, StepKind};
+use crate::plan::graph::{GradientChannel, ObscuranceChannel, StepId};
 use crate::{Error, Result};
 
 impl<'a> Engine<'a> {
@@ -68,58 +65,6 @@ impl<'a> Engine<'a> {
             from.recycle(self.pool);
         }
         Ok(())
-    }
-
-    /// Two steps of which the first leaves its results on the GPU for the second; `None` where they run one by one. Their
-    /// inputs as [`Engine::run`] has them.
-    ///
-    /// # Errors
-    /// A GPU that failed twice.
-    pub fn chained(
-        &self,
-        [first, second]: [StepId; 2],
-        values: &mut [Option<Value>],
-        [middle, region]: [Region; 2],
-        volume: Region,
-    ) -> Result<Option<Vec<Value>>> {
-        let graph = &self.plan.graph;
-        let (a, b) = (&graph.steps[first], &graph.steps[second]);
-        let (Some(gpu), Some(_)) = (self.lane(first, middle), self.lane(second, region)) else { return Ok(None) };
-        let StepKind::Gaussian { sigma, .. } = &a.kind else { return Ok(None) };
-        let value = values[a.inputs[0]].as_mut().expect("inputs are made before their readers");
-        if self.skip && value.constants().is_some() {
-            return Ok(None);
-        }
-        value.materialize(self.pool);
-        let src = self.windowed(a, a.border, value, 0, &graph.wires[a.inputs[0]], middle, volume);
-        let extents = Extents {
-            src: src.view().shape(),
-            middle: middle.shape(),
-            at: src.at,
-            dst: region.shape(),
-            inner: middle.offset_of(&region),
-        };
-        let wires = b.outputs.iter().map(|&w| &graph.wires[w]);
-        let mut outputs: Vec<Value> = wires.map(|w| self.buffers(w.dtype, region, w.components)).collect();
-        let done = match &b.kind {
-            StepKind::Gradient { size, weight, spacing, channels, .. } => {
-                let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: None };
-                gpu.smoothed_gradient(src.view(), &extents, *sigma, &fit, gradient_out(channels, &mut outputs))
-            }
-            StepKind::Window { params, channels } => {
-                let outs = channels.iter().zip(&mut outputs);
-                let mut outs: Vec<WindowOut> =
-                    outs.map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, 0) }).collect();
-                gpu.smoothed_window(src.view(), &extents, *sigma, params, region.lo, &mut outs)
-            }
-            _ => Ok(None),
-        };
-        src.recycle(self.pool);
-        if done.map_err(|e| self.gpu_failed(second, &e))?.is_none() {
-            outputs.into_iter().for_each(|v| v.recycle(self.pool));
-            return Ok(None);
-        }
-        Ok(Some(outputs))
     }
 
     /// The voxels that a mask leaves, for kernels that skip the others.

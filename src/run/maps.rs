@@ -4,8 +4,11 @@ use super::assemble::{Assembler, Item, Place, Target, TaskSlot, as_bytes};
 use super::compute::Finished;
 use super::value::Comp;
 use crate::brick::Scratch;
+use crate::gpu::MapLevels;
+use crate::gpu::maps::MapCodes;
 use crate::grid::{AnyView, Region, View};
 use crate::kernel::Context;
+use crate::kernel::convert::Mapping;
 use crate::kernel::occlusion_map::{Moments, base, coarsen, needed};
 use crate::plan::{MapPlan, OutputPlan};
 use crate::{Error, Result};
@@ -26,18 +29,27 @@ pub fn assemble(
     let last = output.brick_level();
     let mut boxes = chain_boxes(output, map, done.brick);
     let mut cx = Context { level: assembler.level, scratch };
-    let mut made = on_gpu(assembler, index, output, map, done)?.into_iter();
-    if made.len() > 0 {
+    let made = on_gpu(assembler, index, output, target, map, done)?;
+    if made.is_some() {
         (0..=last).for_each(|k| boxes[k] = output.level_box(k, done.brick));
     }
-    let mut moments = match made.len() > 0 && map.first > 0 {
-        true => Moments::default(), // nobody reads the data
-        false => base_level(assembler, output, map, done, boxes[0]),
-    };
+    let base = || base_level(assembler, output, map, done, boxes[0]);
+    if let Some(made) = made {
+        if map.first == 0 {
+            store(assembler, index, output, target, slot, 0, &base(), boxes[0], boxes[0], items)?;
+        }
+        for (k, codes) in (1..).zip(&made.codes) {
+            for (component, voxels) in codes.iter().enumerate() {
+                let place = Place { index, output, target, component, slot };
+                assembler.put(&place, k, boxes[k], voxels.view(boxes[k].shape()), items)?;
+            }
+        }
+        made.last.iter().for_each(|m| keep(target, m, boxes[last], boxes[last]));
+        return Ok(());
+    }
+    let mut moments = base();
     for k in 0..=last {
-        if let Some(level) = (k > 0).then(|| made.next()).flatten() {
-            moments = level;
-        } else if k > 0 {
+        if k > 0 {
             let layout = &map.chain.levels;
             let mut coarse = Moments::default();
             coarsen(&moments, boxes[k - 1], layout[k - 1].shape, layout[k].halved, boxes[k], &mut coarse, &mut cx);
@@ -47,39 +59,50 @@ pub fn assemble(
         if k >= map.first {
             store(assembler, index, output, target, slot, k, &moments, boxes[k], own, items)?;
         }
-        if k == last
-            && let Some(spill) = &target.cells
-        {
-            for (plane, values) in [&moments.mean, &moments.variance].into_iter().enumerate() {
-                spill.write(plane, own, as_bytes(&dense(values, boxes[k], own)));
-            }
+        if k == last {
+            keep(target, &moments, boxes[k], own);
         }
     }
     Ok(())
 }
 
-/// The levels from 1 on over the brick's own cells, where the plan placed the map on the GPU and the brick is not constant;
-/// else nothing.
+/// Keeps cells of the last level that bricks make for the levels beyond.
+fn keep(target: &Target, moments: &Moments, have: Region, own: Region) {
+    let Some(spill) = &target.cells else { return };
+    for (plane, values) in [&moments.mean, &moments.variance].into_iter().enumerate() {
+        spill.write(plane, own, as_bytes(&dense(values, have, own)));
+    }
+}
+
+/// The levels from 1 on over the brick's own cells, where the plan placed the map on the GPU and the brick is not constant.
 fn on_gpu(
     assembler: &Assembler,
     index: usize,
     output: &OutputPlan,
+    target: &Target,
     map: &MapPlan,
     done: &Finished,
-) -> Result<Vec<Moments>> {
+) -> Result<Option<MapLevels>> {
     let plan = assembler.plan;
     let value = done.value(map.source);
     let gpu = assembler.gpu.filter(|_| plan.map_on_gpu(index) && matches!(value.comps[0], Comp::Voxels(_)));
-    let Some((gpu, job)) = gpu.and_then(|g| Some((g, output.map_job(&plan.graph)?))) else { return Ok(Vec::new()) };
+    let Some((gpu, job)) = gpu.and_then(|g| Some((g, output.map_job(&plan.graph)?))) else { return Ok(None) };
     let origin = output.region.lo.map(|v| -v);
-    let (brick, affine) = (done.brick.shift(origin), plan.graph.wires[map.source].affine);
+    let brick = done.brick.shift(origin);
+    let codes = MapCodes {
+        first: map.first,
+        moments: map.moments.clone(),
+        dtype: output.spec.dtype,
+        mapping: Mapping { range: target.range, fill: output.spec.fill },
+        affine: plan.graph.wires[map.source].affine,
+        cells: target.cells.is_some(),
+    };
     let read = job.boxes(brick)[0];
     let src = value.view(0, read.shift(output.region.lo));
-    let levels = gpu.occlusion_levels(src, read, &job, brick, affine);
-    let (levels, _) = levels.map_err(|e| {
-        Error::Failed(format!("the occlusion map {} on the GPU: {e}; --resume continues", output.spec.name))
-    })?;
-    Ok(levels)
+    let made = gpu.occlusion_codes(src, read, &job, brick, &codes);
+    let failed =
+        |e| Error::Failed(format!("the occlusion map {} on the GPU: {e}; --resume continues", output.spec.name));
+    made.map(Some).map_err(failed)
 }
 
 /// The box of each level, in its own cells, that the brick's levels need.

@@ -6,6 +6,7 @@ pub mod budget;
 pub mod cache;
 pub mod cancel;
 pub mod compute;
+mod flows;
 pub mod journal;
 mod lanes;
 pub mod maps;

@@ -121,7 +121,7 @@ fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Res
 /// Opens every output of a group that is not complete.
 pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], resume: bool) -> Result<Target> {
     let output = &plan.outputs[o];
-    let range = range_of(output, globals);
+    let range = output.mapped(globals);
     let mut spec = output.spec.clone();
     if output.auto_range.is_some() {
         spec.fill = output.missing(0, range);
@@ -143,24 +143,6 @@ pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], r
         Spill::open(&dir.join(format!("cells.{deepest}")), shape, per_cell, size_of::<f64>())
     });
     Ok(Target { sink, levels, cells: cells.transpose()?, range })
-}
-
-/// The values that map to 0 and the largest code, from the config or a pre-pass.
-pub fn range_of(output: &OutputPlan, globals: &[Vec<f64>]) -> Option<[f64; 2]> {
-    match output.auto_range {
-        Some(id) => {
-            let [lo, hi] = Plan::global(globals, id);
-            let usable = lo.is_finite() && hi.is_finite();
-            Some(if !usable {
-                [0.0, 1.0]
-            } else if hi > lo {
-                [lo, hi]
-            } else {
-                [lo, lo + 1.0]
-            })
-        }
-        None => output.range,
-    }
 }
 
 /// Commits what a finished task left in one output.

@@ -4,7 +4,7 @@ use crate::grid::{Region, Shape};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
 use crate::plan::tasks::{Group, input_halo, inputs_of};
-use crate::plan::{Plan, Prepass};
+use crate::plan::{FlowPlan, Plan, Prepass};
 
 /// A pruned sub-graph for one stream of bricks.
 #[derive(Debug)]
@@ -15,6 +15,10 @@ pub struct Program {
     /// Input wires with the halo to read.
     pub inputs: Vec<(WireId, [usize; 3])>,
     pub volume: Shape,
+    /// Outputs whose levels may be made with the steps.
+    pub outputs: Vec<usize>,
+    /// Steps that run on the GPU together.
+    pub flows: Vec<FlowPlan>,
 }
 
 impl Program {
@@ -27,7 +31,8 @@ impl Program {
             }
         }
         let inputs = group.inputs.iter().map(|&w| (w, input_halo(plan, group, w))).collect();
-        Program { steps: group.steps.clone(), sinks, inputs, volume: group.shape }
+        let outputs = group.outputs.clone();
+        Program { steps: group.steps.clone(), sinks, inputs, volume: group.shape, outputs, flows: plan.flows.clone() }
     }
 
     /// The stream of a pre-pass over the whole volume.
@@ -37,7 +42,8 @@ impl Program {
         // An input by itself is read without what windows see beyond.
         let halo = |w: WireId| if steps.is_empty() { [0; 3] } else { plan.graph.wires[w].halo };
         let inputs = inputs.into_iter().map(|w| (w, halo(w))).collect();
-        Program { steps, sinks: prepass.wires.clone(), inputs, volume }
+        let sinks = prepass.wires.clone();
+        Program { steps, sinks, inputs, volume, outputs: Vec::new(), flows: Vec::new() }
     }
 
     /// Whether a wire is still wanted after the step at position `at`.
@@ -47,6 +53,11 @@ impl Program {
                 let step = &plan.graph.steps[s];
                 step.inputs.contains(&wire) || step.mask.as_ref().is_some_and(|m| m.wire == wire)
             })
+    }
+
+    /// The flow that starts with a step.
+    pub fn flow_at(&self, step: StepId) -> Option<&FlowPlan> {
+        self.flows.iter().find(|f| f.first(&self.steps) == Some(step))
     }
 
     /// The box of a step's outputs for a brick.

@@ -167,6 +167,7 @@ impl<W: Send> Stream<'_, W> {
             let written = (self.deliver)(&done, work, &mut scratch);
             self.metrics.encode_ns.fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);
             self.trace.span("levels+encode", start, &[("brick", format!("{:?}", work.brick))]);
+            done.ready.into_iter().flat_map(|r| r.levels).for_each(|v| engine.pool.put(v));
             for value in done.values.into_iter().flatten() {
                 value.recycle(engine.pool);
             }

@@ -3,12 +3,14 @@
 //!
 //! Without a Vulkan adapter these tests pass and are listed when all have run, unless OCCLUDE_REQUIRE_GPU_TESTS=1.
 
-mod chains;
 #[path = "../common/mod.rs"]
 mod common;
 mod float_windows;
+mod flow_runs;
+mod flows;
 mod gaussian;
 mod gradient;
+mod levels;
 mod maps;
 mod obscurance;
 mod runs;

@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use occlude::brick::{Scratch, Voxels, gather};
-use occlude::gpu::maps::{MapJob, MapLevel};
+use occlude::gpu::maps::{MapCodes, MapJob, MapLevel};
 use occlude::gpu::{Gpu, facts};
-use occlude::grid::{Affine, DType, Region, Shape};
+use occlude::grid::{Affine, AnyView, DType, Region, Shape, View};
 use occlude::kernel::Context;
+use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::occlusion_map::{Moments, base, coarsen};
 use occlude::kernel::simd::Level;
 use occlude::run::RunOptions;
@@ -231,6 +232,50 @@ fn a_run_makes_maps_on_the_gpu_and_shows_no_brick() {
             let far = values.clone().find(|(a, b)| (a - b).abs() > 1e-6 * 32768.0 + 1e-5 * a.abs());
             assert!(far.is_none() && a.len() == b.len(), "{name}: {far:?}");
             assert!(values.clone().any(|(a, _)| a != 0.0));
+        }
+    }
+}
+
+#[test]
+fn codes_are_those_of_the_levels_bit_for_bit() {
+    let Some(mut gpu) = adapter() else { return };
+    let shape = [19, 22, 37];
+    let list = levels(shape, &[[true; 3], [false, true, true], [true; 3]]);
+    let brick = Region::whole(shape);
+    for (dtype, to, range) in [
+        (DType::U8, DType::U8, Some([-20.0, 90.0])),
+        (DType::I16, DType::U16, Some([-30000.0, 30000.0])),
+        (DType::U16, DType::F32, None),
+    ] {
+        for (name, volume) in fills(dtype, shape) {
+            for affine in [Affine::IDENTITY, Affine { slope: -0.37, intercept: 11.0 }] {
+                let job = MapJob::new(dtype, list.clone()).unwrap();
+                let view = volume.view(shape);
+                gpu.set_cap(1 << 30);
+                let (moments, _) = gpu.occlusion_levels(view, brick, &job, brick, affine).unwrap();
+                let mapping = Mapping { range, fill: 3.0 };
+                let codes = MapCodes { first: 2, moments: vec![1, 0], dtype: to, mapping, affine, cells: true };
+                for cap in [1 << 30, 60_000] {
+                    gpu.set_cap(cap);
+                    let made = gpu.occlusion_codes(view, brick, &job, brick, &codes).unwrap();
+                    assert!(made.codes[0].is_empty(), "level 1 is not stored");
+                    assert_eq!(made.last.as_ref(), moments.last(), "{name} of {dtype}, cap {cap}");
+                    for k in [2, 3] {
+                        let extent = job.own(k, brick).shape();
+                        let values = [&moments[k - 1].variance, &moments[k - 1].mean];
+                        for (values, got) in values.into_iter().zip(&made.codes[k - 1]) {
+                            let mut expect = Voxels::zeroed(to, values.len());
+                            let from = AnyView::F64(View::dense(values, extent));
+                            convert(from, mapping, expect.view_mut(extent));
+                            assert_eq!(
+                                expect.as_bytes(),
+                                got.as_bytes(),
+                                "{name} of {dtype} to {to}, level {k}, cap {cap}"
+                            );
+                        }
+                    }
+                }
+            }
         }
     }
 }

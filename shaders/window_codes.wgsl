@@ -1,0 +1,261 @@
+// From exact sums and extremes of windows of small integers to results: statistics in f64 (double.wgsl), openness in f32
+// (estimators.wgsl), one plane per channel. One thread makes all channels of one voxel.
+//
+// Agrees bit for bit in statistics with src/kernel/window (estimate.rs, emit.rs), in openness within facts::tolerance. Parameters:
+// src/gpu/finish.rs, struct Codes.
+// Bindings, group 0: 0 uniform Codes; 1 storage, read: packed voxels; 2 storage, written: bits of f32 results; 3 storage,
+// read: extremes of codes (window_extremes.wgsl); 4 storage, read: sums of codes; 5 storage, read: sums of their squares. What
+// no channel needs may be anything.
+// Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no atomics: an output has one writer.
+
+struct Codes {
+    out_y: u32,     // extents of the output
+    out_x: u32,
+    centre: u32,    // output 0 among the voxels, and their strides
+    in_z: u32,
+    in_y: u32,
+    packing: u32,   // log2 of voxels per word
+    flip: u32,      // the sign bit of a packed voxel, or 0: what codes are more than values
+    wide: u32,      // 1: sums of codes have two words; 2: those of squares
+    at_z: u32,      // output 0 in the source, whose windows are cut there
+    at_y: u32,
+    at_x: u32,
+    radius_z: u32,
+    radius_y: u32,
+    radius_x: u32,
+    size_z: u32,    // extents of the source
+    size_y: u32,
+    size_x: u32,
+    centred: u32,   // how the numerator is made exact: 0 as it is, 1 about 2^15, 2 in 128 bits
+    count: u32,     // channels
+    stride: u32,    // from plane to plane of the results
+    flipped: u32,   // 1: smaller is denser
+    scaled: u32,    // 1: results are of slope * v + intercept
+    threads: u32,
+    needs: u32,     // 1: sums of codes are there, 2: of squares, 4: extremes; 8: means are asked for, 16: variances
+    slope: vec2<u32>, // f64
+    intercept: vec2<u32>,
+    channels: array<vec4<u32>, 4>, // what each is, and 256 where constant windows are half open
+}
+
+@group(0) @binding(0) var<uniform> p: Codes;
+@group(0) @binding(1) var<storage, read> voxels: array<u32>;
+@group(0) @binding(2) var<storage, read_write> output: array<u32>;
+@group(0) @binding(3) var<storage, read> extremes: array<u32>;
+@group(0) @binding(4) var<storage, read> sums: array<u32>;
+@group(0) @binding(5) var<storage, read> squares: array<u32>;
+
+// What a window of codes holds.
+struct Window {
+    v: u32,
+    lo: u32,
+    hi: u32,
+    n: u32,
+    s1: vec2<u32>,
+    s2: vec2<u32>,
+    numerator: vec2<u32>, // f64, as what follows: n^2 times the variance
+    mean: vec2<u32>,      // scaled
+    variance: vec2<u32>,  // not scaled
+}
+
+fn along(at: u32, radius: u32, size: u32) -> u32 {
+    return min(at + radius, size - 1u) - (max(at, radius) - radius) + 1u;
+}
+
+fn zeros128(v: vec4<u32>) -> u32 {
+    if (v.z | v.w) == 0u {
+        return 64u + zeros64(v.xy);
+    }
+    return zeros64(v.zw);
+}
+
+// An integer of 128 bits, rounded once.
+fn of_wide(sign: u32, v: vec4<u32>) -> vec2<u32> {
+    let shift = zeros128(v);
+    if shift >= 64u {
+        return joined(sign, 0, v.xy);
+    }
+    var top = v.zw;
+    var low = v.xy;
+    if shift > 0u {
+        top = left64(v.zw, shift) | right64(v.xy, 64u - shift);
+        low = left64(v.xy, shift);
+    }
+    top.x |= select(0u, 1u, (low.x | low.y) != 0u);
+    return joined(sign, 64 - i32(shift), top);
+}
+
+// The integer nearest to one of 128 bits that f64 holds.
+fn held(v: vec4<u32>) -> vec4<u32> {
+    let x = parts_of(of_wide(0u, v));
+    if x.exponent <= 0 {
+        return vec4<u32>(right64(x.bits, u32(-x.exponent)), 0u, 0u);
+    }
+    if x.exponent >= 64 {
+        return vec4<u32>(0u, 0u, left64(x.bits, u32(x.exponent) - 64u));
+    }
+    let n = u32(x.exponent);
+    return vec4<u32>(left64(x.bits, n), right64(x.bits, 64u - n));
+}
+
+fn difference(a: vec4<u32>, b: vec4<u32>) -> vec2<u32> {
+    if less128(a, b) {
+        return of_wide(SIGN, minus128(b, a));
+    }
+    return of_wide(0u, minus128(a, b));
+}
+
+// n s2 - s1^2 as src/kernel/window/estimate.rs rounds it: fused products, the square in two parts.
+fn fused(n: u32, s1: vec2<u32>, s2: vec2<u32>) -> vec2<u32> {
+    let square = times64(s1, s1);
+    let high = held(square);
+    let first = difference(times64(vec2<u32>(n, 0u), s2), high);
+    return sum_of(first, negated(difference(square, high)));
+}
+
+fn numerator(w: Window) -> vec2<u32> {
+    if p.centred == 2u {
+        return of_wide(0u, minus128(times64(vec2<u32>(w.n, 0u), w.s2), times64(w.s1, w.s1)));
+    }
+    if p.centred == 0u {
+        return fused(w.n, w.s1, w.s2);
+    }
+    let shift = left64(vec2<u32>(w.n, 0u), 15u);
+    let low = less64(w.s1, shift);
+    let s1 = select(minus64(w.s1, shift), minus64(shift, w.s1), low);
+    let s2 = plus64(minus64(w.s2, left64(w.s1, 16u)), left64(vec2<u32>(w.n, 0u), 30u));
+    return fused(w.n, s1, s2);
+}
+
+fn scaled(v: vec2<u32>) -> vec2<u32> {
+    if p.scaled == 0u {
+        return v;
+    }
+    return sum_of(product_of(p.slope, v), p.intercept);
+}
+
+// Of a positive or negative integer a - b.
+fn of_difference(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
+    if less64(a, b) {
+        return negated(of_integer(minus64(b, a)));
+    }
+    return of_integer(minus64(a, b));
+}
+
+fn mean(w: Window) -> vec2<u32> {
+    return scaled(quotient_of(of_difference(w.s1, times32(w.n, p.flip)), of_integer(vec2<u32>(w.n, 0u))));
+}
+
+fn variance(w: Window) -> vec2<u32> {
+    let inverse = quotient_of(ONE, of_integer(vec2<u32>(w.n, 0u)));
+    return product_of(product_of(w.numerator, inverse), inverse);
+}
+
+fn spread(v: vec2<u32>) -> vec2<u32> {
+    if p.scaled == 0u {
+        return v;
+    }
+    return product_of(product_of(p.slope, p.slope), v);
+}
+
+fn single(v: vec2<u32>) -> f32 {
+    return bitcast<f32>(narrowed(v));
+}
+
+fn openness(w: Window, kind: u32, half: bool) -> f32 {
+    let constant = select(1.0, 0.5, half);
+    let turned = p.flipped == 1u;
+    if kind == 6u {
+        if w.lo == w.hi {
+            return constant;
+        }
+        let below = f32(w.v - w.lo);
+        let above = f32(w.hi - w.v);
+        let over = single(of_integer(minus64(w.s1, times32(w.n, w.lo))));
+        let under = single(of_integer(minus64(times32(w.n, w.hi), w.s1)));
+        if turned {
+            return power(above, below, f32(w.hi - w.lo), under, over);
+        }
+        return power(below, above, f32(w.hi - w.lo), over, under);
+    }
+    if is_zero64(w.numerator) {
+        return constant;
+    }
+    let away = single(of_difference(times32(w.n, w.v), w.s1));
+    return by_spread(kind, select(away, -away, turned) / sqrt(single(w.numerator)));
+}
+
+fn extreme(code: u32) -> u32 {
+    return narrowed(scaled(of_difference(vec2<u32>(code, 0u), vec2<u32>(p.flip, 0u))));
+}
+
+fn result(w: Window, channel: u32) -> u32 {
+    let negative = p.scaled == 1u && (p.slope.y & SIGN) != 0u;
+    switch channel & 255u {
+        case 0u: {
+            return narrowed(w.mean);
+        }
+        case 1u, 2u: {
+            return extreme(select(w.lo, w.hi, negative != (channel == 2u)));
+        }
+        case 3u: {
+            return narrowed(spread(w.variance));
+        }
+        case 4u: {
+            let root = root_of(w.variance);
+            if p.scaled == 0u {
+                return narrowed(root);
+            }
+            return narrowed(product_of(vec2<u32>(p.slope.x, p.slope.y & ~SIGN), root));
+        }
+        case 5u: {
+            return narrowed(sum_of(spread(w.variance), product_of(w.mean, w.mean)));
+        }
+        default: {
+            return bitcast<u32>(openness(w, channel & 255u, channel >= 256u));
+        }
+    }
+}
+
+@compute @workgroup_size(64)
+fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+          @builtin(local_invocation_index) local: u32) {
+    let thread = thread_of(group, groups, local);
+    if thread >= p.threads {
+        return;
+    }
+    let x = thread % p.out_x;
+    let y = (thread / p.out_x) % p.out_y;
+    let z = thread / (p.out_x * p.out_y);
+    let index = p.centre + z * p.in_z + y * p.in_y + x;
+    var w = Window();
+    w.v = unpacked(voxels[index >> p.packing], index, p.packing) ^ p.flip;
+    w.n = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_y + y, p.radius_y, p.size_y)
+        * along(p.at_x + x, p.radius_x, p.size_x);
+    if (p.needs & 4u) != 0u {
+        w.lo = extremes[thread] & 0xffffu;
+        w.hi = extremes[thread] >> 16u;
+    }
+    if (p.needs & 1u) != 0u {
+        w.s1 = vec2<u32>(sums[thread], 0u);
+        if (p.wide & 1u) != 0u {
+            w.s1 = vec2<u32>(sums[2u * thread], sums[2u * thread + 1u]);
+        }
+    }
+    if (p.needs & 2u) != 0u {
+        w.s2 = vec2<u32>(squares[thread], 0u);
+        if (p.wide & 2u) != 0u {
+            w.s2 = vec2<u32>(squares[2u * thread], squares[2u * thread + 1u]);
+        }
+        w.numerator = numerator(w);
+    }
+    if (p.needs & 8u) != 0u {
+        w.mean = mean(w);
+    }
+    if (p.needs & 16u) != 0u {
+        w.variance = variance(w);
+    }
+    for (var c = 0u; c < p.count; c += 1u) {
+        output[c * p.stride + thread] = result(w, p.channels[c / 4u][c % 4u]);
+    }
+}
