@@ -61,7 +61,11 @@ fn volume() -> tempfile::TempDir {
 
 /// Whether a run under these settings reads columns.
 fn streams(dir: &Path, sets: &[&str]) -> bool {
-    let config = parse(dir, CONFIG, sets);
+    streams_of(dir, CONFIG, sets)
+}
+
+fn streams_of(dir: &Path, text: &str, sets: &[&str]) -> bool {
+    let config = parse(dir, text, sets);
     let infos: Vec<_> = open_inputs(&config).unwrap().iter().map(|s| s.info().clone()).collect();
     let plan = Plan::new(&config, &infos, &mut || Err("none".into())).unwrap();
     plan.graph.steps.iter().any(|s| s.streamed)
@@ -142,6 +146,54 @@ fn a_region_is_that_part_of_the_whole() {
                 let row = &values[(z * SHAPE[1] + y) * SHAPE[2]..][lo[2]..hi[2]];
                 assert!(row.iter().zip(at.by_ref()).all(|(a, b)| a == b), "row {z} {y}");
             }
+        }
+    }
+}
+
+/// Sweeps of an opacity: by a table that falls and has plateaus, so that no order of stored values would do.
+fn opacity_of(input: &str, rest: &str) -> String {
+    let table = "[stage.tf]\nop = 'transfer'\ninput = 'vol'\n\
+                 points = [[0, 0, 0, 0, 0], [90, 0.9, 0, 0, 0], [110, 0.9, 0, 0, 0], [125, 0.2, 0, 0, 0], [160, 1, 0, 0, 0]]\n\
+                 [stage.floats]\nop = 'combine'\ninputs = ['tf']\nop_kind = 'max'\n";
+    CONFIG
+        .replace("[stage.sweep]", &format!("{table}[stage.sweep]"))
+        .replace("input = \"vol\"\ndirections", &format!("input = \"{input}\"\n{rest}\ndirections"))
+}
+
+#[test]
+fn opacities_read_columns_too_and_come_out_as_their_floats_do() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    let bounded = "where = { input = 'vol', min = 100 }";
+    for (rest, budgets) in [("", &SMALL[..]), (bounded, &SMALL[1..2])] {
+        let floats = opacity_of("floats", rest);
+        assert!(!streams_of(dir.path(), &floats, &[]));
+        run(dir.path(), &floats, &[]);
+        let (whole, table) = (decode(&out), opacity_of("tf", rest));
+        assert!(!streams_of(dir.path(), &table, &[]));
+        run(dir.path(), &table, &[]);
+        assert_same("ranks in boxes", &whole, &decode(&out));
+        for budget in budgets {
+            assert!(streams_of(dir.path(), &table, &[budget]), "{budget}");
+            run(dir.path(), &table, &[budget]);
+            assert_same(&format!("{rest} {budget}"), &whole, &decode(&out));
+        }
+    }
+}
+
+#[test]
+fn sweeps_weighed_by_normals_read_columns_too() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    let plain = CONFIG.replace("directions", "weight_by_normal = true\ndirections");
+    for text in [plain, opacity_of("tf", "weight_by_normal = true")] {
+        assert!(!streams_of(dir.path(), &text, &[]));
+        run(dir.path(), &text, &[]);
+        let whole = decode(&out);
+        for sets in [&[SMALL[2]][..], &["run.memory=60MiB", "run.threads=1"]] {
+            assert!(streams_of(dir.path(), &text, sets), "{sets:?}");
+            run(dir.path(), &text, sets);
+            assert_same(&format!("{sets:?}"), &whole, &decode(&out));
         }
     }
 }

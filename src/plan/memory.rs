@@ -96,7 +96,8 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
             let sweep = obscurance::Prepared::new(params);
             let wide = dtype.result() == DType::F64;
             if step.streamed {
-                return (sweep.streamed_bytes(dtype, volume, dst) + narrowed(dst, wide) + masked(step, dst)) as u64;
+                let kernel = sweep.streamed_bytes(dtype, volume, dst, normal.is_some());
+                return (kernel + narrowed(dst, normal.is_some()) + narrowed(dst, wide) + masked(step, dst)) as u64;
             }
             sweep.scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
                 + narrowed(src, colour.is_some()) / 3 * 4

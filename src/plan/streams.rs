@@ -67,13 +67,13 @@ fn stream(plan: &mut Plan, steps: &[StepId], streamed: bool) {
     plan.graph.demand_halos();
 }
 
-/// Sweeps of openness, on the CPU, of an input.
+/// Sweeps on the CPU of an input, or of opacities whose ranks are known, without colours.
 fn candidates(plan: &Plan) -> Vec<StepId> {
     let fits = |s: &StepId| {
         let step = &plan.graph.steps[*s];
-        let StepKind::Obscurance { channels, normal, .. } = &step.kind else { return false };
+        let StepKind::Obscurance { channels, .. } = &step.kind else { return false };
         let input = matches!(plan.graph.wires[step.inputs[0]].producer, Producer::Input(_));
-        input && normal.is_none() && channels[..] == [ObscuranceChannel::Openness] && !plan.on_gpu(*s)
+        input && channels[..] == [ObscuranceChannel::Openness] && !plan.on_gpu(*s)
     };
     (0..plan.graph.steps.len()).filter(fits).collect()
 }
@@ -103,9 +103,9 @@ pub fn work(plan: &Plan, group: &Group, amplification: f64) -> f64 {
 /// Voxels that a streamed step fetches for a brick in the middle of the volume.
 pub fn fetched(plan: &Plan, step: StepId, brick: Shape, volume: Shape) -> usize {
     let step = &plan.graph.steps[step];
-    let StepKind::Obscurance { params, .. } = &step.kind else { return 0 };
+    let StepKind::Obscurance { params, normal, .. } = &step.kind else { return 0 };
     let lo: [i64; 3] = std::array::from_fn(|a| (volume[a].saturating_sub(brick[a]) / 2) as i64);
     let whole = Region::whole(volume);
     let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + brick[a] as i64)).grow(step.halo).clip(&whole);
-    Prepared::new(params).streamed_voxels(brick, whole)
+    Prepared::new(params).streamed_voxels(brick, whole, normal.is_some())
 }

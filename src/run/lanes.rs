@@ -33,10 +33,7 @@ impl<'a> Engine<'a> {
         // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
         let colour = has_colour.then(|| interleave([0, 1, 2].map(|c| inputs[1].view(c, src_box))));
         let colour = colour.as_ref().map(|c| View::dense(&c[..], src_box.shape()));
-        let normal = has_normal.then(|| {
-            let value = inputs[1 + usize::from(has_colour)];
-            std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
-        });
+        let normal = has_normal.then(|| three_of(inputs[1 + usize::from(has_colour)], region));
         let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
         // Sweeps sum in fixed point and round to f32; results of f64 data are widened.
         let wide = outputs[0].dtype == DType::F64;
@@ -148,9 +145,15 @@ impl<'a> Engine<'a> {
         let mut read = |part: Region, dst: AnyViewMut| fetch(step.inputs[0], part, dst);
         let src = inputs[0].view(0, region);
         let mut cx = Context { level: self.level, scratch };
-        let out = view_mut(&mut openness, 0);
-        let needed = self.needed(mask, region);
-        let done = self.sweeps[&id].sweep_streamed(src, region, volume, needed, out, &mut read, &mut cx)?;
+        let normal = inputs.get(1).map(|value| three_of(value, region));
+        let io = ObscuranceIo {
+            colour: None,
+            normal: normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape()))),
+            needed: self.needed(mask, region),
+            openness: Some(view_mut(&mut openness, 0)),
+            rgb: None,
+        };
+        let done = self.sweeps[&id].sweep_streamed(src, region, volume, io, &mut read, &mut cx)?;
         self.metrics.lines(id, done.lines);
         if done.flat
             && self.skip
@@ -210,6 +213,11 @@ fn interleave(views: [AnyView; 3]) -> Vec<[f32; 4]> {
         crate::with_view!(AnyView, view, v => run(v, c, &mut out));
     }
     out
+}
+
+/// The three components of a value, narrowed.
+fn three_of(value: &Value, region: Region) -> [Vec<f32>; 3] {
+    std::array::from_fn(|c| narrow(value.view(c, region)))
 }
 
 fn narrow(view: AnyView) -> Vec<f32> {

@@ -26,6 +26,7 @@ fn params(directions: usize, max_distance: f64) -> ObscuranceParams {
         flipped: false,
         missing: None,
         ambient: [1.0; 3],
+        ranks: None,
     }
 }
 
