@@ -136,7 +136,7 @@ fn a_sweep_of_opacities_ranks_the_table_instead_of_the_voxels() {
     // The normal is that of the opacity, and a table under a mask is no function of the voxel.
     assert_eq!(of(&format!("{text}weight_by_normal = true"), "o").len(), 3);
     let masked = text.replace("op = 'transfer'", "op = 'transfer'\nwhere = { input = 'a', min = 3 }");
-    assert_eq!(of(&masked, "o"), ["tf.opacity of a", "o.openness of tf.opacity"]);
+    assert_eq!(of(&masked, "o"), ["tf.opacity of a, a", "o.openness of tf.opacity"]);
 }
 
 #[test]
