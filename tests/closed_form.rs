@@ -144,7 +144,7 @@ fn faces_of_the_phantom_bleed_by_their_closed_form_on_the_axes() {
             let (face, ambient) = if c == 0 { (1.0, 1.0) } else { (face[c - 1], ambient[c - 1]) };
             let forms = [0.5, 0.0].map(|near| closed((h as f64 - near) / dmax, face, ambient));
             let (lo, hi) = (forms[0].min(forms[1]), forms[0].max(forms[1]));
-            assert!(lo - 1e-3 < got && got < hi + 1e-3, "axis {axis} channel {c}: {got}, closed forms {lo} {hi}");
+            assert!(lo - 2e-3 < got && got < hi + 2e-3, "axis {axis} channel {c}: {got}, closed forms {lo} {hi}");
         }
     }
 }

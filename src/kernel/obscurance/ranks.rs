@@ -1,6 +1,6 @@
-//! Floats of few distinct values as bytes. A sweep asks only which of two voxels is denser, so the rank of a value among those
-//! that occur serves as well as the value: opacities of 8-bit data, or of any data through a table with few steps, are swept
-//! as fast as bytes are.
+//! Ranks in the place of values. A sweep asks only which of two voxels is denser, so the rank of a value among those that
+//! occur serves as well: what a table makes of 8- or 16-bit data is swept as fast as the data ([`Ranks`], known before a
+//! voxel is read), and so are floats of few values, whatever made them ([`rank`], brick by brick).
 
 use std::sync::Arc;
 
