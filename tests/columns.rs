@@ -43,18 +43,21 @@ levels = 1
 /// Budgets at which a box with its halo would be far smaller than a column's.
 const SMALL: [&str; 3] = ["run.memory=44MiB", "run.memory=48MiB", "run.memory=72MiB"];
 
-fn volume() -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
-    // Noise on waves with missing voxels; far to the right nothing, which chunks of the copy leave out.
-    let data = fill(SHAPE, |z, y, x| {
+/// Noise on waves with missing voxels; far to the right nothing, which chunks of the copy leave out.
+fn voxels() -> Vec<u8> {
+    fill(SHAPE, |z, y, x| {
         if x >= 360 {
             return 0;
         }
         let wave = (z as f64 * 0.07).sin() + (y as f64 * 0.05).cos() + (x as f64 * 0.04).sin();
         let noise = hash(3, ((z * 1024 + y) * 1024 + x) as u64);
         if noise.is_multiple_of(31) { 7 } else { (120.0 + 30.0 * wave) as u8 + (noise >> 20) as u8 % 9 }
-    });
-    write_npy(&dir.path().join("vol.npy"), "|u1", SHAPE, &data);
+    })
+}
+
+fn volume() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    write_npy(&dir.path().join("vol.npy"), "|u1", SHAPE, &voxels());
     run(dir.path(), COPY, &[]);
     dir
 }
@@ -67,8 +70,9 @@ fn streams(dir: &Path, sets: &[&str]) -> bool {
 fn streams_of(dir: &Path, text: &str, sets: &[&str]) -> bool {
     let config = parse(dir, text, sets);
     let infos: Vec<_> = open_inputs(&config).unwrap().iter().map(|s| s.info().clone()).collect();
-    let plan = Plan::new(&config, &infos, &mut || Err("none".into())).unwrap();
-    plan.graph.steps.iter().any(|s| s.streamed)
+    // A budget for which everything is too large streams nothing.
+    let plan = Plan::new(&config, &infos, &mut || Err("none".into()));
+    plan.is_ok_and(|plan| plan.graph.steps.iter().any(|s| s.streamed.is_some()))
 }
 
 #[test]
@@ -178,6 +182,29 @@ fn opacities_read_columns_too_and_come_out_as_their_floats_do() {
             run(dir.path(), &table, &[budget]);
             assert_same(&format!("{rest} {budget}"), &whole, &decode(&out));
         }
+    }
+}
+
+#[test]
+fn floats_read_columns_through_their_table() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    let bytes = opacity_of("tf", "");
+    run(dir.path(), &bytes, &[]);
+    let whole = decode(&out);
+    let values: Vec<f32> = voxels().iter().map(|&v| if v == 7 { f32::NAN } else { v as f32 }).collect();
+    write_npy(&dir.path().join("floats.npy"), "<f4", SHAPE, &f32_bytes(&values));
+    let floats = bytes.replace("vol.npy", "floats.npy").replace("nodata = 7\n", "");
+    assert!(!streams_of(dir.path(), &floats, &[]));
+    run(dir.path(), &floats, &[]);
+    assert_same("boxes of floats", &whole, &decode(&out));
+    let budgets = [56, 64, 80, 96, 112, 128, 160].map(|mib| format!("run.memory={mib}MiB"));
+    let small: Vec<&String> = budgets.iter().filter(|b| streams_of(dir.path(), &floats, &[b.as_str()])).collect();
+    assert!(!small.is_empty(), "no budget takes columns");
+    for budget in [small[0], small[small.len() - 1]] {
+        let report = run(dir.path(), &floats, &[budget.as_str()]);
+        assert_same(budget, &whole, &decode(&out));
+        assert!(report.read_amplification > 3.0, "{}", report.read_amplification);
     }
 }
 

@@ -11,7 +11,7 @@ use crate::kernel::gradient::GradientOut;
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::window::WindowOut;
 use crate::kernel::{Context, pointwise};
-use crate::plan::graph::{GradientChannel, ObscuranceChannel, StepId, StepKind};
+use crate::plan::graph::{GradientChannel, ObscuranceChannel, Producer, Step, StepId, StepKind};
 use crate::{Error, Result};
 
 impl<'a> Engine<'a> {
@@ -142,7 +142,7 @@ impl<'a> Engine<'a> {
         let step = &self.plan.graph.steps[id];
         let wire = &self.plan.graph.wires[step.outputs[0]];
         let mut openness = self.buffers(DType::F32, region, 1);
-        let mut read = |part: Region, dst: AnyViewMut| fetch(step.inputs[0], part, dst);
+        let mut read = |part: Region, dst: AnyViewMut| self.fetched(step, part, dst, fetch);
         let src = inputs[0].view(0, region);
         let mut cx = Context { level: self.level, scratch };
         let normal = inputs.get(1).map(|value| three_of(value, region));
@@ -170,6 +170,24 @@ impl<'a> Engine<'a> {
         pointwise::scale(openness.view(0, region), Affine::IDENTITY, None, view_mut(&mut wide, 0));
         openness.recycle(self.pool);
         Ok(vec![wide])
+    }
+
+    /// A box of a streamed step's first input: read, or read and put through the transfer that makes it.
+    fn fetched(&self, step: &Step, part: Region, dst: AnyViewMut, fetch: &Fetch) -> Result<()> {
+        let graph = &self.plan.graph;
+        let Some(input) = step.streamed.filter(|w| *w != step.inputs[0]) else {
+            return fetch(step.inputs[0], part, dst);
+        };
+        let Producer::Step(made) = graph.wires[step.inputs[0]].producer else { unreachable!("inputs are read") };
+        let StepKind::Transfer { points, .. } = &graph.steps[made].kind else { unreachable!("streams of transfers") };
+        let wire = &graph.wires[input];
+        let mut stored = self.pool.take(wire.dtype, part.voxels());
+        let read = fetch(input, part, stored.view_mut(part.shape()));
+        if read.is_ok() {
+            pointwise::transfer(stored.view(part.shape()), wire.affine, wire.missing, points, Some(dst), None);
+        }
+        self.pool.put(stored);
+        read
     }
 
     /// The GPU, where it is to run a step on this box: not a single voxel, which stands for a constant brick, and not while

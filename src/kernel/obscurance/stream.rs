@@ -68,6 +68,11 @@ impl Prepared {
         tiles(dst_box, normal).map(of_tile).sum()
     }
 
+    /// Voxels that [`Prepared::sweep_streamed`] fetches at once at most.
+    pub fn slab_voxels(&self, volume: Shape, dst: Shape, normal: bool) -> usize {
+        self.streamed_sizes(volume, dst, normal).1
+    }
+
     fn streamed_sizes(&self, volume: Shape, dst: Shape, normal: bool) -> (Sizes, usize) {
         let tile = tile_of(dst, normal);
         let most = driver::groups(&self.families).map(|group| column::most(group, tile, volume));
