@@ -109,6 +109,7 @@ fn cases() -> Vec<Case> {
             flipped: false,
             missing: None,
             ambient: [1.0; 3],
+            ranks: None,
         };
         let name = format!("obscurance {directions} d={max_distance}");
         list.push(Case { name, kernel: Kernel::Obscurance(Prepared::new(&params)) });

@@ -1,14 +1,14 @@
 //! Speed and accuracy of obscurance sweeps, one thread.
 //!
-//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT | --bricks DISTANCE | --halves | --weights | --where]`:
+//! `cargo bench --bench obscurance [-- --accuracy | --edge N | --raw FILE Z Y X | --only TEXT | --bricks DISTANCE | --halves | --weights | --where | --opacities]`:
 //! CPU seconds of the best of several sweeps over a cube of 256^3 voxels, by field, element type, reach and instruction set;
 //! with `--accuracy`, errors of direction sets against 6000 directions; with `--bricks`, what halos cost; with `--halves`, two
-//! threads; with `--weights`, colours and normals; with `--where`, masks.
+//! threads; with `--weights`, colours and normals; with `--where`, masks; with `--opacities`, what a transfer table makes.
 
 use occlude::brick::Scratch;
 use occlude::grid::{AnyView, AnyViewMut, Region, Shape, View, ViewMut};
 use occlude::kernel::Context;
-use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
+use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared, Ranks};
 use occlude::kernel::simd::Level;
 use occlude::stage::{DirectionSet, DirectionWeights, Rho};
 
@@ -23,6 +23,7 @@ fn params() -> ObscuranceParams {
         flipped: false,
         missing: None,
         ambient: [1.0; 3],
+        ranks: None,
     }
 }
 
@@ -230,6 +231,32 @@ fn masks() {
     }
 }
 
+/// Opacities of 8- and 16-bit voxels: as ranks of what a table makes of them, and as the floats that it makes.
+fn opacities() {
+    fn table(n: usize) -> Vec<f32> {
+        (0..n).map(|i| (i as f32 / n as f32 - 0.1).max(0.0).sqrt()).collect()
+    }
+    let shape = [256; 3];
+    let values = field("ct", shape);
+    let u8s: Vec<u8> = values.iter().map(|v| (v * 256.0) as u8).collect();
+    let u16s: Vec<u16> = values.iter().map(|v| (v * 65536.0) as u16).collect();
+    let tables = [table(1 << 8), table(1 << 16)];
+    let floats = [
+        u8s.iter().map(|v| tables[0][*v as usize]).collect::<Vec<f32>>(),
+        u16s.iter().map(|v| tables[1][*v as usize]).collect(),
+    ];
+    let views = [AnyView::U8(View::dense(&u8s, shape)), AnyView::U16(View::dense(&u16s, shape))];
+    let level = Level::detect();
+    for max_distance in [64.0, 256.0] {
+        let p = ObscuranceParams { max_distance, ..params() };
+        for (kind, ((view, table), floats)) in ["u8", "u16"].iter().zip(views.iter().zip(&tables).zip(&floats)) {
+            row("values", kind, level, &p, *view);
+            row("ranks", kind, level, &ObscuranceParams { ranks: Ranks::new(table), ..p.clone() }, *view);
+            row("floats", kind, level, &p, AnyView::F32(View::dense(floats, shape)));
+        }
+    }
+}
+
 fn speed(edge: usize, only: Option<&str>) {
     let shape = [edge; 3];
     let wanted = |name: &str| only.is_none_or(|o| name.contains(o));
@@ -319,6 +346,9 @@ fn main() {
     }
     if after("--where").is_some() {
         return masks();
+    }
+    if after("--opacities").is_some() {
+        return opacities();
     }
     if after("--halves").is_some() {
         return halves(256);

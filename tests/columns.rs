@@ -43,28 +43,36 @@ levels = 1
 /// Budgets at which a box with its halo would be far smaller than a column's.
 const SMALL: [&str; 3] = ["run.memory=44MiB", "run.memory=48MiB", "run.memory=72MiB"];
 
-fn volume() -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
-    // Noise on waves with missing voxels; far to the right nothing, which chunks of the copy leave out.
-    let data = fill(SHAPE, |z, y, x| {
+/// Noise on waves with missing voxels; far to the right nothing, which chunks of the copy leave out.
+fn voxels() -> Vec<u8> {
+    fill(SHAPE, |z, y, x| {
         if x >= 360 {
             return 0;
         }
         let wave = (z as f64 * 0.07).sin() + (y as f64 * 0.05).cos() + (x as f64 * 0.04).sin();
         let noise = hash(3, ((z * 1024 + y) * 1024 + x) as u64);
         if noise.is_multiple_of(31) { 7 } else { (120.0 + 30.0 * wave) as u8 + (noise >> 20) as u8 % 9 }
-    });
-    write_npy(&dir.path().join("vol.npy"), "|u1", SHAPE, &data);
+    })
+}
+
+fn volume() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    write_npy(&dir.path().join("vol.npy"), "|u1", SHAPE, &voxels());
     run(dir.path(), COPY, &[]);
     dir
 }
 
 /// Whether a run under these settings reads columns.
 fn streams(dir: &Path, sets: &[&str]) -> bool {
-    let config = parse(dir, CONFIG, sets);
+    streams_of(dir, CONFIG, sets)
+}
+
+fn streams_of(dir: &Path, text: &str, sets: &[&str]) -> bool {
+    let config = parse(dir, text, sets);
     let infos: Vec<_> = open_inputs(&config).unwrap().iter().map(|s| s.info().clone()).collect();
-    let plan = Plan::new(&config, &infos, &mut || Err("none".into())).unwrap();
-    plan.graph.steps.iter().any(|s| s.streamed)
+    // A budget for which everything is too large streams nothing.
+    let plan = Plan::new(&config, &infos, &mut || Err("none".into()));
+    plan.is_ok_and(|plan| plan.graph.steps.iter().any(|s| s.streamed.is_some()))
 }
 
 #[test]
@@ -142,6 +150,77 @@ fn a_region_is_that_part_of_the_whole() {
                 let row = &values[(z * SHAPE[1] + y) * SHAPE[2]..][lo[2]..hi[2]];
                 assert!(row.iter().zip(at.by_ref()).all(|(a, b)| a == b), "row {z} {y}");
             }
+        }
+    }
+}
+
+/// Sweeps of an opacity: by a table that falls and has plateaus, so that no order of stored values would do.
+fn opacity_of(input: &str, rest: &str) -> String {
+    let table = "[stage.tf]\nop = 'transfer'\ninput = 'vol'\n\
+                 points = [[0, 0, 0, 0, 0], [90, 0.9, 0, 0, 0], [110, 0.9, 0, 0, 0], [125, 0.2, 0, 0, 0], [160, 1, 0, 0, 0]]\n\
+                 [stage.floats]\nop = 'combine'\ninputs = ['tf']\nop_kind = 'max'\n";
+    CONFIG
+        .replace("[stage.sweep]", &format!("{table}[stage.sweep]"))
+        .replace("input = \"vol\"\ndirections", &format!("input = \"{input}\"\n{rest}\ndirections"))
+}
+
+#[test]
+fn opacities_read_columns_too_and_come_out_as_their_floats_do() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    let bounded = "where = { input = 'vol', min = 100 }";
+    for (rest, budgets) in [("", &SMALL[..]), (bounded, &SMALL[1..2])] {
+        let floats = opacity_of("floats", rest);
+        assert!(!streams_of(dir.path(), &floats, &[]));
+        run(dir.path(), &floats, &[]);
+        let (whole, table) = (decode(&out), opacity_of("tf", rest));
+        assert!(!streams_of(dir.path(), &table, &[]));
+        run(dir.path(), &table, &[]);
+        assert_same("ranks in boxes", &whole, &decode(&out));
+        for budget in budgets {
+            assert!(streams_of(dir.path(), &table, &[budget]), "{budget}");
+            run(dir.path(), &table, &[budget]);
+            assert_same(&format!("{rest} {budget}"), &whole, &decode(&out));
+        }
+    }
+}
+
+#[test]
+fn floats_read_columns_through_their_table() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    let bytes = opacity_of("tf", "");
+    run(dir.path(), &bytes, &[]);
+    let whole = decode(&out);
+    let values: Vec<f32> = voxels().iter().map(|&v| if v == 7 { f32::NAN } else { v as f32 }).collect();
+    write_npy(&dir.path().join("floats.npy"), "<f4", SHAPE, &f32_bytes(&values));
+    let floats = bytes.replace("vol.npy", "floats.npy").replace("nodata = 7\n", "");
+    assert!(!streams_of(dir.path(), &floats, &[]));
+    run(dir.path(), &floats, &[]);
+    assert_same("boxes of floats", &whole, &decode(&out));
+    let budgets = [56, 64, 80, 96, 112, 128, 160].map(|mib| format!("run.memory={mib}MiB"));
+    let small: Vec<&String> = budgets.iter().filter(|b| streams_of(dir.path(), &floats, &[b.as_str()])).collect();
+    assert!(!small.is_empty(), "no budget takes columns");
+    for budget in [small[0], small[small.len() - 1]] {
+        let report = run(dir.path(), &floats, &[budget.as_str()]);
+        assert_same(budget, &whole, &decode(&out));
+        assert!(report.read_amplification > 3.0, "{}", report.read_amplification);
+    }
+}
+
+#[test]
+fn sweeps_weighed_by_normals_read_columns_too() {
+    let dir = volume();
+    let out = dir.path().join("o.zarr");
+    let plain = CONFIG.replace("directions", "weight_by_normal = true\ndirections");
+    for text in [plain, opacity_of("tf", "weight_by_normal = true")] {
+        assert!(!streams_of(dir.path(), &text, &[]));
+        run(dir.path(), &text, &[]);
+        let whole = decode(&out);
+        for sets in [&[SMALL[2]][..], &["run.memory=60MiB", "run.threads=1"]] {
+            assert!(streams_of(dir.path(), &text, sets), "{sets:?}");
+            run(dir.path(), &text, sets);
+            assert_same(&format!("{sets:?}"), &whole, &decode(&out));
         }
     }
 }

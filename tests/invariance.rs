@@ -87,6 +87,27 @@ op = "saliency"
 input = "sweep"
 size = 3
 scale = "max"
+[stage.windowed]
+op = "window"
+input = "sweep"
+low = 0.3
+high = 0.9
+mode = "stretch"
+[stage.lines]
+op = "saliency"
+input = "windowed"
+[stage.strong]
+op = "opacity_modulation"
+input = "paint"
+by = "lines"
+threshold = 0.01
+gain = 5
+[stage.again]
+op = "obscurance"
+input = "strong"
+directions = 12
+max_distance = 7
+weight_by_normal = true
 [stage.light]
 op = "combine"
 inputs = ["ao", "rank", "sweep"]
@@ -156,12 +177,17 @@ chunk = 16
 path = "out/coloured.npy"
 from = "coloured"
 dtype = "f32"
+[output.again]
+path = "out/again.zarr"
+from = ["again", "lines", "strong"]
+chunk = 16
+shard = "none"
 [output.light]
 path = "out/light.raw"
 from = "light"
 "#;
 
-const OUTPUTS: [&str; 14] = [
+const OUTPUTS: [&str; 15] = [
     "stats.zarr",
     "extremes.zarr",
     "shares.zarr",
@@ -175,6 +201,7 @@ const OUTPUTS: [&str; 14] = [
     "masked.zarr",
     "edge.zarr",
     "coloured.npy",
+    "again.zarr",
     "light.raw",
 ];
 
@@ -226,6 +253,43 @@ fn bricks_threads_and_budgets_never_show() {
             assert_same(&format!("{name} with {sets:?}"), &a.0, &b.0);
             assert_eq!(a.1, b.1, "metadata of {name} with {sets:?}");
         }
+    }
+}
+
+#[test]
+fn a_chain_of_stages_is_the_chain_of_their_runs() {
+    let dir = volume();
+    run(dir.path(), CONFIG, &[]);
+    let (whole, _) = one(&dir.path().join("out/again.zarr"));
+    // What the chain reads at first, then one stage a run, on what the run before it has written.
+    let input = |name: &str| format!("[input.{name}]\npath = '{name}.npy'\nspacing = [2, 1, 1]\n");
+    let links: [(&[&str], &str, &str); 6] = [
+        (&["vol"], "sweep", "op = 'obscurance'\ninput = 'vol'\ndirections = 12\nmax_distance = 9"),
+        (&["vol"], "paint", "op = 'transfer'\ninput = 'vol'\npoints = [[0, 0, 1, 0, 0], [65535, 1, 0, 0, 1]]"),
+        (&["sweep"], "windowed", "op = 'window'\ninput = 'sweep'\nlow = 0.3\nhigh = 0.9\nmode = 'stretch'"),
+        (&["windowed"], "lines", "op = 'saliency'\ninput = 'windowed'"),
+        (
+            &["paint", "lines"],
+            "strong",
+            "op = 'opacity_modulation'\ninput = 'paint'\nby = 'lines'\nthreshold = 0.01\ngain = 5",
+        ),
+        (
+            &["strong"],
+            "again",
+            "op = 'obscurance'\ninput = 'strong'\ndirections = 12\nmax_distance = 7\nweight_by_normal = true",
+        ),
+    ];
+    for (inputs, name, stage) in links {
+        let inputs: String = inputs.iter().map(|name| input(name)).collect();
+        let out = format!("[output.o]\npath = '{name}.npy'\nfrom = '{name}_'\ndtype = 'f32'\n");
+        run(dir.path(), &format!("{inputs}[stage.{name}_]\n{stage}\n{out}"), &[]);
+    }
+    for (component, name) in ["again", "lines", "strong"].into_iter().enumerate() {
+        let alone = decode(&dir.path().join(format!("{name}.npy")));
+        let (shape, values) = &alone["level 0 component 0"];
+        assert!(values.iter().any(|v| *v != values[0]), "{name} says nothing");
+        let (of, together) = &whole[&format!("level 0 component {component}")];
+        assert!(shape == of && values == together, "{name} differs");
     }
 }
 

@@ -120,6 +120,26 @@ fn obscurance_keeps_its_channels_apart_from_colours_and_normals() {
 }
 
 #[test]
+fn a_sweep_of_opacities_ranks_the_table_instead_of_the_voxels() {
+    let dir = tempfile::tempdir().unwrap();
+    island(dir.path());
+    let text = "[input.a]\npath = 'vol.npy'\n[stage.tf]\nop = 'transfer'\ninput = 'a'\npoints = [[0, 0, 0, 0, 0], [9, 1, 1, 1, 1]]\n\
+                [stage.o]\nop = 'obscurance'\ninput = 'tf'\ndirections = 12\nmax_distance = 4\n";
+    let of = |text: &str, from: &str| {
+        let text = format!("{text}\n[output.o]\npath = 'o.zarr'\nfrom = '{from}'\n");
+        let (_, plan) = occlude::plan::explain(&parse(dir.path(), &text, &[])).unwrap();
+        let steps = plan["steps"].as_array().unwrap();
+        steps.iter().map(|s| format!("{} of {}", s["makes"], s["reads"]).replace('"', "")).collect::<Vec<_>>()
+    };
+    assert_eq!(of(text, "o"), ["o.openness of a"]);
+    assert_eq!(of(&format!("{text}colour = 'tf.rgb'"), "o.rgb"), ["tf.rgb of a", "o.rgb of a, tf.rgb"]);
+    // The normal is that of the opacity, and a table under a mask is no function of the voxel.
+    assert_eq!(of(&format!("{text}weight_by_normal = true"), "o").len(), 3);
+    let masked = text.replace("op = 'transfer'", "op = 'transfer'\nwhere = { input = 'a', min = 3 }");
+    assert_eq!(of(&masked, "o"), ["tf.opacity of a, a", "o.openness of tf.opacity"]);
+}
+
+#[test]
 fn lines_without_needed_voxels_are_not_searched_and_counted() {
     let dir = tempfile::tempdir().unwrap();
     island(dir.path());

@@ -237,6 +237,7 @@ mod tests {
             flipped: false,
             missing: None,
             ambient: [1.0; 3],
+            ranks: None,
         })
     }
 

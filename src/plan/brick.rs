@@ -181,7 +181,7 @@ fn amplification(plan: &Plan, group: &Group, shape: Shape) -> f64 {
             .product::<f64>()
     };
     let mean = inputs.iter().map(|&w| one(w)).sum::<f64>() / inputs.len().max(1) as f64;
-    let streamed = group.steps.iter().filter(|&&s| plan.graph.steps[s].streamed);
+    let streamed = group.steps.iter().filter(|&&s| plan.graph.steps[s].streamed.is_some());
     let fetched: usize = streamed.map(|&s| streams::fetched(plan, s, shape, group.shape)).sum();
     mean + fetched as f64 / shape.iter().product::<usize>() as f64
 }

@@ -109,8 +109,9 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
         mib(brick.parked)
     );
     let _ = writeln!(w, "  read amplification {:.2}", brick.amplification);
-    for step in group.steps.iter().map(|&s| &plan.graph.steps[s]).filter(|s| s.streamed) {
-        let (stages, input) = (step.stages.join("+"), reads(plan, step));
+    for step in group.steps.iter().map(|&s| &plan.graph.steps[s]) {
+        let Some(wire) = step.streamed else { continue };
+        let (stages, input) = (step.stages.join("+"), &plan.graph.wires[wire].name);
         let _ = writeln!(
             w,
             "  {stages} reads the columns of its lines in {input} while it runs, instead of a halo of {:?}",
@@ -245,7 +246,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         .map(|(s, (step, (_, device, reason)))| {
             json!({
                 "stages": step.stages, "kernel": step.kind.name(), "reads": reads(plan, step), "makes": makes(plan, step),
-                "reach": step.reach, "halo": step.halo, "streamed": step.streamed, "device": device, "reason": reason,
+                "reach": step.reach, "halo": step.halo, "streamed": step.streamed.is_some(), "device": device, "reason": reason,
                 "gpu_flow": plan.flow_of(s),
             })
         })

@@ -41,7 +41,7 @@ pub fn find(graph: &Graph, on_gpu: &[bool]) -> Vec<FlowPlan> {
     let mut flows: Vec<FlowPlan> = Vec::new();
     for (s, step) in graph.steps.iter().enumerate() {
         let point = !ops(graph, step, &[]).is_empty();
-        if step.mask.is_some() || step.streamed || !(point || on_gpu[s] && has_kernel(graph, step)) {
+        if step.mask.is_some() || step.streamed.is_some() || !(point || on_gpu[s] && has_kernel(graph, step)) {
             continue;
         }
         let Some(at) = flow_of(graph, &mut flows, step, point) else { continue };
@@ -133,7 +133,9 @@ fn has_kernel(graph: &Graph, step: &Step) -> bool {
         && outputs
         && match &step.kind {
             StepKind::Window { params, channels } => Channels::of(params, channels, wire.dtype == DType::F32).is_some(),
-            StepKind::Gaussian { .. } | StepKind::Gradient { .. } | StepKind::Obscurance { .. } => true,
+            // Ranks are looked up by the host.
+            StepKind::Obscurance { params, .. } => params.ranks.is_none(),
+            StepKind::Gaussian { .. } | StepKind::Gradient { .. } => true,
             _ => false,
         }
 }

@@ -85,15 +85,9 @@ pub struct Step {
     pub mask: Option<Mask>,
     /// Voxels beyond the brick that the step computes: the largest of its outputs'.
     pub halo: [usize; 3],
-    /// The first input is read box by box while the step runs, instead of with its reach; see [`super::streams`].
-    pub streamed: bool,
-}
-
-impl Step {
-    /// The wire that is read box by box while the step runs.
-    pub fn fetched(&self) -> Option<WireId> {
-        self.streamed.then(|| self.inputs[0])
-    }
+    /// The first input is read box by box while the step runs, instead of with its reach, out of this wire: itself, or the
+    /// input that a transfer makes it of. See [`super::streams`].
+    pub streamed: Option<WireId>,
 }
 
 /// What a step computes; `channel` lists go with [`Step::outputs`].
@@ -230,7 +224,7 @@ impl Graph {
                 StepKind::Obscurance { normal, .. } => *normal,
                 _ => None,
             };
-            let fetched = self.steps[s].fetched();
+            let fetched = self.steps[s].streamed.map(|_| self.steps[s].inputs[0]);
             for w in self.steps[s].inputs.clone() {
                 let need = if Some(w) == point || Some(w) == fetched { halo } else { add3(halo, reach) };
                 self.wires[w].halo = max3(self.wires[w].halo, need);

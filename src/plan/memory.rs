@@ -97,8 +97,11 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Obscurance { params, colour, normal, .. } => {
             let sweep = obscurance::Prepared::new(params);
             let wide = dtype.result() == DType::F64;
-            if step.streamed {
-                return (sweep.streamed_bytes(dtype, volume, dst) + narrowed(dst, wide) + masked(step, dst)) as u64;
+            if let Some(read) = step.streamed {
+                let kernel = sweep.streamed_bytes(dtype, volume, dst, normal.is_some());
+                let made = if read == step.inputs[0] { 0 } else { plan.graph.wires[read].dtype.size() };
+                let kernel = kernel + made * sweep.slab_voxels(volume, dst, normal.is_some());
+                return (kernel + narrowed(dst, normal.is_some()) + narrowed(dst, wide) + masked(step, dst)) as u64;
             }
             sweep.scratch_bytes(dtype, src, dst, colour.is_some(), normal.is_some())
                 + narrowed(src, colour.is_some()) / 3 * 4

@@ -153,7 +153,7 @@ impl Look<'_> {
         let beyond = |s: StepId| {
             let step = &graph.steps[s];
             let region = of_step(s).grow(step.reach).clip(&volume);
-            step.fetched().is_none_or(|w| self.constant(w, region).is_some())
+            step.streamed.is_none_or(|w| self.constant(w, region).is_some())
         };
         let mut masked = false;
         for &s in &self.group.steps {

@@ -2,7 +2,7 @@
 //! of one direction crosses; where the budget leaves only small bricks beside it, a sweep reads each family's column for
 //! itself, which takes more reading and a fraction of the memory. The bits are the same, so that a resumed run may change it.
 
-use super::graph::{ObscuranceChannel, Producer, StepId, StepKind};
+use super::graph::{ObscuranceChannel, Producer, StepId, StepKind, WireId};
 use super::{Group, Plan, brick, tasks};
 use crate::Result;
 use crate::config::Config;
@@ -60,25 +60,35 @@ fn least(plan: &Plan) -> u64 {
     plan.groups.iter().map(|g| brick::least_bytes(plan, g)).max().unwrap_or(0)
 }
 
-fn stream(plan: &mut Plan, steps: &[StepId], streamed: bool) {
-    steps.iter().for_each(|&s| plan.graph.steps[s].streamed = streamed);
+fn stream(plan: &mut Plan, steps: &[(StepId, WireId)], streamed: bool) {
+    steps.iter().for_each(|&(s, wire)| plan.graph.steps[s].streamed = streamed.then_some(wire));
     plan.graph.demand_halos();
 }
 
-/// Sweeps of openness, on the CPU, of an input.
-fn candidates(plan: &Plan) -> Vec<StepId> {
-    let fits = |s: &StepId| {
-        let step = &plan.graph.steps[*s];
-        let StepKind::Obscurance { channels, normal, .. } = &step.kind else { return false };
-        let input = matches!(plan.graph.wires[step.inputs[0]].producer, Producer::Input(_));
-        input && normal.is_none() && channels[..] == [ObscuranceChannel::Openness] && !plan.on_gpu(*s)
+/// Sweeps on the CPU without colours, and what they would read: an input that is their density, or of which a transfer makes
+/// their density voxel by voxel.
+fn candidates(plan: &Plan) -> Vec<(StepId, WireId)> {
+    let graph = &plan.graph;
+    let is_input = |w: &WireId| matches!(graph.wires[*w].producer, Producer::Input(_));
+    let read = |s: StepId| {
+        let StepKind::Obscurance { channels, .. } = &graph.steps[s].kind else { return None };
+        let density = graph.steps[s].inputs[0];
+        let wire = match graph.wires[density].producer {
+            Producer::Input(_) => density,
+            Producer::Step(t) => match (&graph.steps[t].kind, &graph.steps[t].mask) {
+                (StepKind::Transfer { .. }, None) => graph.steps[t].inputs[0],
+                _ => return None,
+            },
+        };
+        let fits = channels[..] == [ObscuranceChannel::Openness] && !plan.on_gpu(s);
+        (fits && is_input(&wire)).then_some((s, wire))
     };
-    (0..plan.graph.steps.len()).filter(fits).collect()
+    (0..graph.steps.len()).filter_map(read).collect()
 }
 
 /// Whether a step of the group is streamed.
 pub fn any(plan: &Plan, group: &Group) -> bool {
-    group.steps.iter().any(|&s| plan.graph.steps[s].streamed)
+    group.steps.iter().any(|&s| plan.graph.steps[s].streamed.is_some())
 }
 
 /// Relative work per voxel of bricks that read so many input voxels for each of theirs. A sweep's columns are read without
@@ -91,8 +101,11 @@ pub fn work(plan: &Plan, group: &Group, amplification: f64) -> f64 {
         _ => 0.0,
     };
     let swept = group.steps.iter().map(directions).fold(0.0, f64::max);
+    // A transfer table costs more than a read: 0.6 of these units, a guess of 6 ns per voxel that was not measured.
+    let made = |&s: &StepId| plan.graph.steps[s].streamed.is_some_and(|w| w != plan.graph.steps[s].inputs[0]);
+    let reading = if group.steps.iter().any(made) { 0.68 } else { 0.08 };
     match any(plan, group) {
-        true => 0.24 * swept + 0.08 * amplification,
+        true => 0.24 * swept + reading * amplification,
         false if swept > 0.0 => amplification.powf(0.8) * (0.3 + 0.7 * swept / 42.0),
         false => amplification.powf(0.8),
     }
@@ -101,9 +114,9 @@ pub fn work(plan: &Plan, group: &Group, amplification: f64) -> f64 {
 /// Voxels that a streamed step fetches for a brick in the middle of the volume.
 pub fn fetched(plan: &Plan, step: StepId, brick: Shape, volume: Shape) -> usize {
     let step = &plan.graph.steps[step];
-    let StepKind::Obscurance { params, .. } = &step.kind else { return 0 };
+    let StepKind::Obscurance { params, normal, .. } = &step.kind else { return 0 };
     let lo: [i64; 3] = std::array::from_fn(|a| (volume[a].saturating_sub(brick[a]) / 2) as i64);
     let whole = Region::whole(volume);
     let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + brick[a] as i64)).grow(step.halo).clip(&whole);
-    Prepared::new(params).streamed_voxels(brick, whole)
+    Prepared::new(params).streamed_voxels(brick, whole, normal.is_some())
 }

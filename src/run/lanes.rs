@@ -8,7 +8,7 @@ use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
 use crate::kernel::gradient::GradientOut;
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::{Context, pointwise};
-use crate::plan::graph::{GradientChannel, ObscuranceChannel, StepId};
+use crate::plan::graph::{GradientChannel, ObscuranceChannel, Producer, Step, StepId, StepKind};
 use crate::{Error, Result};
 
 impl<'a> Engine<'a> {
@@ -30,10 +30,7 @@ impl<'a> Engine<'a> {
         // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
         let colour = has_colour.then(|| interleave([0, 1, 2].map(|c| inputs[1].view(c, src_box))));
         let colour = colour.as_ref().map(|c| View::dense(&c[..], src_box.shape()));
-        let normal = has_normal.then(|| {
-            let value = inputs[1 + usize::from(has_colour)];
-            std::array::from_fn::<Vec<f32>, 3, _>(|c| narrow(value.view(c, region)))
-        });
+        let normal = has_normal.then(|| three_of(inputs[1 + usize::from(has_colour)], region));
         let normal = normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape())));
         // Sweeps sum in fixed point and round to f32; results of f64 data are widened.
         let wide = outputs[0].dtype == DType::F64;
@@ -90,12 +87,18 @@ impl<'a> Engine<'a> {
         let step = &self.plan.graph.steps[id];
         let wire = &self.plan.graph.wires[step.outputs[0]];
         let mut openness = self.buffers(DType::F32, region, 1);
-        let mut read = |part: Region, dst: AnyViewMut| fetch(step.inputs[0], part, dst);
+        let mut read = |part: Region, dst: AnyViewMut| self.fetched(step, part, dst, fetch);
         let src = inputs[0].view(0, region);
         let mut cx = Context { level: self.level, scratch };
-        let out = view_mut(&mut openness, 0);
-        let needed = self.needed(mask, region);
-        let done = self.sweeps[&id].sweep_streamed(src, region, volume, needed, out, &mut read, &mut cx)?;
+        let normal = inputs.get(1).map(|value| three_of(value, region));
+        let io = ObscuranceIo {
+            colour: None,
+            normal: normal.as_ref().map(|n| std::array::from_fn(|c| View::dense(&n[c], region.shape()))),
+            needed: self.needed(mask, region),
+            openness: Some(view_mut(&mut openness, 0)),
+            rgb: None,
+        };
+        let done = self.sweeps[&id].sweep_streamed(src, region, volume, io, &mut read, &mut cx)?;
         self.metrics.lines(id, done.lines);
         if done.flat
             && self.skip
@@ -112,6 +115,24 @@ impl<'a> Engine<'a> {
         pointwise::scale(openness.view(0, region), Affine::IDENTITY, None, view_mut(&mut wide, 0));
         openness.recycle(self.pool);
         Ok(vec![wide])
+    }
+
+    /// A box of a streamed step's first input: read, or read and put through the transfer that makes it.
+    fn fetched(&self, step: &Step, part: Region, dst: AnyViewMut, fetch: &Fetch) -> Result<()> {
+        let graph = &self.plan.graph;
+        let Some(input) = step.streamed.filter(|w| *w != step.inputs[0]) else {
+            return fetch(step.inputs[0], part, dst);
+        };
+        let Producer::Step(made) = graph.wires[step.inputs[0]].producer else { unreachable!("inputs are read") };
+        let StepKind::Transfer { points, .. } = &graph.steps[made].kind else { unreachable!("streams of transfers") };
+        let wire = &graph.wires[input];
+        let mut stored = self.pool.take(wire.dtype, part.voxels());
+        let read = fetch(input, part, stored.view_mut(part.shape()));
+        if read.is_ok() {
+            pointwise::transfer((stored.view(part.shape()), wire.affine, wire.missing), points, Some(dst), None);
+        }
+        self.pool.put(stored);
+        read
     }
 
     /// The GPU, where it is to run a step on this box: not a single voxel, which stands for a constant brick, and not while
@@ -155,6 +176,11 @@ fn interleave(views: [AnyView; 3]) -> Vec<[f32; 4]> {
         crate::with_view!(AnyView, view, v => run(v, c, &mut out));
     }
     out
+}
+
+/// The three components of a value, narrowed.
+fn three_of(value: &Value, region: Region) -> [Vec<f32>; 3] {
+    std::array::from_fn(|c| narrow(value.view(c, region)))
 }
 
 fn narrow(view: AnyView) -> Vec<f32> {

@@ -84,7 +84,7 @@ impl Reader<'_> {
             }
             let Producer::Input(input) = plan.graph.wires[wire].producer else { continue };
             let region = wire_box(brick, halo, self.program.volume);
-            let fetched = self.program.steps.iter().any(|&s| plan.graph.steps[s].fetched() == Some(wire));
+            let fetched = self.program.steps.iter().any(|&s| plan.graph.steps[s].streamed == Some(wire));
             let why = if fetched { Why::Fetched } else { Why::Brick };
             let (value, missing) = self.input(input, wire, region, place, why)?;
             self.metrics.gathered(region.voxels() as u64);

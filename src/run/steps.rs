@@ -119,7 +119,7 @@ impl<'a> Engine<'a> {
         }
         if self.skip
             && matches!(mask, MaskValue::All)
-            && !step.streamed
+            && step.streamed.is_none()
             && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)?
         {
             return Ok(values);
@@ -129,7 +129,7 @@ impl<'a> Engine<'a> {
                 value.materialize(self.pool);
             }
         }
-        let mut outputs = if step.streamed {
+        let mut outputs = if step.streamed.is_some() {
             self.sweep_streamed(id, &inputs_of(step, values), mask, region, volume, fetch, scratch)?
         } else {
             self.compute(id, &inputs_of(step, values), mask, region, volume, step.border, scratch)?

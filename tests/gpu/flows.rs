@@ -139,6 +139,7 @@ fn recipes(affine: Affine) -> Vec<(&'static str, Vec<FlowStep>, bool)> {
             spacing: [1.0; 3],
             flipped: solid_low,
             missing: None,
+            ranks: None,
             ambient: [1.0; 3],
         };
         step(Kernel::Sweep(params), &[of])

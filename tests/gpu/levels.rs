@@ -201,6 +201,7 @@ fn the_comparison_can_fail() {
 
 /// Every operation on one, two or three channels by the CPU, in f32.
 pub fn pointwise_on_cpu(op: &Op, reads: &[(AnyView, Affine)], shape: Shape) -> Vec<f32> {
+    let read = |i: usize| (reads[i].0, reads[i].1, None);
     let mut out = vec![7.0f32; shape.iter().product()];
     let view = AnyViewMut::F32(ViewMut::dense(&mut out, shape));
     match op {
@@ -208,12 +209,12 @@ pub fn pointwise_on_cpu(op: &Op, reads: &[(AnyView, Affine)], shape: Shape) -> V
         Op::Times { by } => {
             pointwise::scale(reads[0].0, Affine { slope: *by, intercept: 0.0 }, None, view);
         }
-        Op::Window { low, high, mode } => pointwise::openness_window(reads[0].0, *low, *high, *mode, view),
-        Op::ByVariance { sigma_max2 } => pointwise::modulate_by_variance(reads[0].0, reads[1].0, *sigma_max2, view),
+        Op::Window { low, high, mode } => pointwise::openness_window(read(0), *low, *high, *mode, view),
+        Op::ByVariance { sigma_max2 } => pointwise::modulate_by_variance(read(0), read(1), *sigma_max2, view),
         Op::BySaliency { threshold, gain } => {
-            pointwise::modulate_by_saliency(reads[0].0, reads[1].0, *threshold, *gain, view);
+            pointwise::modulate_by_saliency(read(0), read(1), *threshold, *gain, view);
         }
-        Op::Light { k } => pointwise::ambient_light(reads[0].0, reads[1].0, *k, view),
+        Op::Light { k } => pointwise::ambient_light(read(0), read(1), *k, view),
         Op::Combine(kind) => {
             let inputs: Vec<_> = reads.iter().map(|(v, a)| (*v, *a, None)).collect();
             pointwise::combine(&inputs, *kind, view);
@@ -222,10 +223,10 @@ pub fn pointwise_on_cpu(op: &Op, reads: &[(AnyView, Affine)], shape: Shape) -> V
             let mut rest = [0, 1, 2].map(|_| vec![0.0f32; shape.iter().product()]);
             let [a, b, c] = rest.each_mut().map(|v| AnyViewMut::F32(ViewMut::dense(v, shape)));
             match component {
-                1 => pointwise::transfer(reads[0].0, reads[0].1, None, points, Some(view), None),
-                2 => pointwise::transfer(reads[0].0, reads[0].1, None, points, None, Some([view, b, c])),
-                3 => pointwise::transfer(reads[0].0, reads[0].1, None, points, None, Some([a, view, c])),
-                _ => pointwise::transfer(reads[0].0, reads[0].1, None, points, None, Some([a, b, view])),
+                1 => pointwise::transfer(read(0), points, Some(view), None),
+                2 => pointwise::transfer(read(0), points, None, Some([view, b, c])),
+                3 => pointwise::transfer(read(0), points, None, Some([a, view, c])),
+                _ => pointwise::transfer(read(0), points, None, Some([a, b, view])),
             }
         }
         Op::Length | Op::Share { .. } => unreachable!("gradients and sweeps have it"),

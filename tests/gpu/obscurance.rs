@@ -4,7 +4,7 @@ use occlude::brick::{Scratch, Voxels};
 use occlude::gpu::{Gpu, facts};
 use occlude::grid::{AnyViewMut, DType, Region, Shape, ViewMut};
 use occlude::kernel::Context;
-use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
+use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared, Ranks};
 use occlude::kernel::simd::Level;
 use occlude::stage::{DirectionSet, DirectionWeights, Rho};
 
@@ -26,6 +26,7 @@ fn params(directions: usize, max_distance: f64) -> ObscuranceParams {
         flipped: false,
         missing: None,
         ambient: [1.0; 3],
+        ranks: None,
     }
 }
 
@@ -111,6 +112,10 @@ fn every_parameter_equals_the_cpu() {
     with(&|p| p.weights = DirectionWeights::Voronoi);
     with(&|p| p.flipped = true);
     with(&|p| p.missing = Some(voxels.at(7) as i64));
+    with(&|p| {
+        p.missing = Some(voxels.at(7) as i64);
+        p.ranks = Ranks::new(&(0..1 << 16).map(|i| (i / 7 % 5000) as f32).collect::<Vec<f32>>());
+    });
     for spacing in [[2.0, 1.0, 1.0], [0.3, 1.7, 0.9], [1.0, 1.0, 40.0]] {
         with(&|p| p.spacing = spacing);
     }

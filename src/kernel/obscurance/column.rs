@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use super::driver::{self, FRAMES, in_frame};
-use super::keys::{Code, Coded, Key, LANES, Volume};
+use super::keys::{self, Code, Coded, Key, LANES, Volume, put_row, with_key};
 use super::lines::{Family, displacement};
 use crate::grid::{Region, Shape, View};
 use crate::kernel::simd::Level;
@@ -173,14 +173,14 @@ struct Plane {
 
 multiversion! {
     /// Planes along z (`axis` 0) or y.
-    fn natural['a, T: Coded](
-        src: View<'a, T>, axis: usize, planes: &[Plane], row: usize, code: Code<T>, out: &mut [T::Key],
+    fn natural['a, 'r, T: Coded](
+        src: View<'a, T>, axis: usize, planes: &[Plane], row: usize, code: Code<'r, T>, out: &mut [T::Key],
     ) -> T::Key = put_natural;
 }
 multiversion! {
     /// Planes along x, lanes along z.
-    fn turned['a, T: Coded](
-        src: View<'a, T>, planes: &[Plane], row: usize, code: Code<T>, out: &mut [T::Key],
+    fn turned['a, 'r, T: Coded](
+        src: View<'a, T>, planes: &[Plane], row: usize, code: Code<'r, T>, out: &mut [T::Key],
     ) -> T::Key = put_turned;
 }
 
@@ -201,10 +201,7 @@ fn put_natural<T: Coded>(
             let start = (plane.start + (j * row) as i64) as usize;
             let (before, rest) = out[start - LANES..start - LANES + row + LANES].split_at_mut(LANES);
             before.fill(T::Key::ZERO);
-            for (to, &v) in rest.iter_mut().zip(from) {
-                *to = code.key(v);
-                most = most.max(*to);
-            }
+            most = with_key!(code, key => put_row(from, key, rest, most));
             rest[width..].fill(T::Key::ZERO);
         }
     }
@@ -213,36 +210,23 @@ fn put_natural<T: Coded>(
 
 #[inline(always)]
 fn put_turned<T: Coded>(src: View<T>, planes: &[Plane], row: usize, code: Code<T>, out: &mut [T::Key]) -> T::Key {
-    const TILE: usize = 64;
     let mut most = T::Key::ZERO;
-    let [nz, ny, nx] = src.shape;
-    for y in 0..ny {
-        for z0 in (0..nz).step_by(TILE) {
-            let tz = TILE.min(nz - z0);
-            for x0 in (0..nx).step_by(16) {
-                let tx = 16.min(nx - x0);
-                let mut tile = [[T::Key::ZERO; TILE]; 16];
-                for z in 0..tz {
-                    for (to, &v) in tile.iter_mut().zip(&src.row_at(z0 + z, y)[x0..][..tx]) {
-                        to[z] = code.key(v);
-                    }
-                }
-                for (from, plane) in tile.iter().zip(&planes[x0..][..tx]) {
-                    if !(plane.rows[0]..plane.rows[1]).contains(&y) {
-                        continue;
-                    }
-                    let start = (plane.start + (y * row) as i64) as usize;
-                    if z0 == 0 {
-                        out[start - LANES..start].fill(T::Key::ZERO);
-                    }
-                    out[start + z0..][..tz].copy_from_slice(&from[..tz]);
-                    if z0 + tz == nz {
-                        out[start + nz..start + row].fill(T::Key::ZERO);
-                    }
-                    most = from[..tz].iter().fold(most, |m, k| m.max(*k));
-                }
+    let nz = src.shape[0];
+    keys::turn_rows(src, code, |[z0, y, x0], [tz, tx], tile| {
+        for (from, plane) in tile.iter().zip(&planes[x0..][..tx]) {
+            if !(plane.rows[0]..plane.rows[1]).contains(&y) {
+                continue;
             }
+            let start = (plane.start + (y * row) as i64) as usize;
+            if z0 == 0 {
+                out[start - LANES..start].fill(T::Key::ZERO);
+            }
+            out[start + z0..][..tz].copy_from_slice(&from[..tz]);
+            if z0 + tz == nz {
+                out[start + nz..start + row].fill(T::Key::ZERO);
+            }
+            most = from[..tz].iter().fold(most, |m, k| m.max(*k));
         }
-    }
+    });
     most
 }

@@ -1,5 +1,7 @@
 //! Voxels as unsigned keys in the order of their density, in a padded copy that every line can read without a test.
 
+use super::ObscuranceParams;
+use super::ranks::Ranks;
 use crate::grid::{AnyViewMut, Region, Shape, View, ViewMut, Voxel};
 use crate::multiversion;
 
@@ -12,6 +14,8 @@ pub(super) trait Key: Plain + Ord + Default + Send + Sync + 'static {
     const ZERO: Self;
     const MAX: Self;
     fn not(self) -> Self;
+    fn of_rank(rank: u16) -> Self;
+    fn index(self) -> usize;
 }
 
 macro_rules! key {
@@ -23,6 +27,10 @@ macro_rules! key {
             const MAX: Self = <$t>::MAX;
             #[inline(always)]
             fn not(self) -> Self { !self }
+            #[inline(always)]
+            fn of_rank(rank: u16) -> Self { rank as $t }
+            #[inline(always)]
+            fn index(self) -> usize { self as usize }
         }
     )*};
 }
@@ -143,44 +151,91 @@ impl<'a, K: Key> Volume<'a, K> {
 
 /// The map from voxels of a volume to keys.
 #[derive(Clone, Copy)]
-pub(super) struct Code<T> {
+pub(super) struct Code<'a, T> {
     pub missing: Option<T>,
     pub flipped: bool,
+    /// What is compared in the place of the codes, if anything.
+    pub ranks: Option<&'a Ranks>,
 }
 
-impl<T: Coded> Code<T> {
+impl<'a, T: Coded> Code<'a, T> {
+    pub fn new(params: &'a ObscuranceParams) -> Self {
+        let ranks = params.ranks.as_ref();
+        assert!(ranks.is_none_or(|r| r.of::<T>()), "ranks of another type than {}", T::DTYPE);
+        Code { missing: missing_of(params.missing), flipped: params.flipped, ranks }
+    }
+
     #[inline(always)]
-    pub fn key(self, v: T) -> T::Key {
-        match (is_missing(v, self.missing), self.flipped) {
+    pub fn is_missing(&self, v: T) -> bool {
+        is_missing(v, self.missing)
+    }
+
+    /// The key of a voxel whose code ranks so.
+    #[inline(always)]
+    pub fn key(&self, v: T, rank: impl Fn(T::Key) -> T::Key) -> T::Key {
+        match (self.is_missing(v), self.flipped) {
             (true, _) => T::Key::ZERO,
-            (false, true) => v.code().not(),
-            (false, false) => v.code(),
+            (false, true) => rank(v.code()).not(),
+            (false, false) => rank(v.code()),
         }
     }
+}
+
+/// Evaluates `$body` with `$key` as the map from a voxel to its key: one loop for codes and one for ranks, so that neither
+/// asks which it is voxel by voxel.
+macro_rules! with_key {
+    ($code:expr, $key:ident => $body:expr) => {
+        match $code.ranks {
+            None => {
+                let $key = |v| $code.key(v, |code| code);
+                $body
+            }
+            Some(ranks) => {
+                let $key = |v| $code.key(v, |code| ranks.of_code(code));
+                $body
+            }
+        }
+    };
+}
+pub(super) use with_key;
+
+/// The least and the greatest key of a row's voxels that are not missing; the greatest and the least possible ones if
+/// there are none.
+#[inline(always)]
+pub(super) fn ends<T: Coded>(row: &[T], code: &Code<T>, key: impl Fn(T) -> T::Key) -> (T::Key, T::Key) {
+    row.iter().fold((T::Key::MAX, T::Key::ZERO), |(lo, hi), &v| {
+        let k = key(v);
+        (lo.min(if code.is_missing(v) { T::Key::MAX } else { k }), hi.max(k))
+    })
 }
 
 #[inline(always)]
 fn least_of<T: Coded>(of: View<T>, code: Code<T>) -> T::Key {
-    let mut least = T::Key::MAX;
-    for row in (0..of.shape[0]).flat_map(|z| (0..of.shape[1]).map(move |y| of.row_at(z, y))) {
-        for &v in row {
-            least = least.min(if is_missing(v, code.missing) { T::Key::MAX } else { code.key(v) });
-        }
-    }
-    least
+    let rows = (0..of.shape[0]).flat_map(|z| (0..of.shape[1]).map(move |y| of.row_at(z, y)));
+    with_key!(code, key => rows.fold(T::Key::MAX, |least, row| least.min(ends(row, &code, key).0)))
 }
 
 multiversion! {
     /// Fills a padded copy in natural order and returns the greatest key.
-    pub(super) fn encode['a, T: Coded](src: View<'a, T>, code: Code<T>, out: &mut [T::Key]) -> T::Key = natural;
+    pub(super) fn encode['a, 'r, T: Coded](src: View<'a, T>, code: Code<'r, T>, out: &mut [T::Key]) -> T::Key = natural;
 }
 multiversion! {
     /// Fills a padded copy in `[x, y, z]` order.
-    pub(super) fn encode_turned['a, T: Coded](src: View<'a, T>, code: Code<T>, out: &mut [T::Key]) -> () = turned;
+    pub(super) fn encode_turned['a, 'r, T: Coded](src: View<'a, T>, code: Code<'r, T>, out: &mut [T::Key]) -> () = turned;
 }
 multiversion! {
     /// Least key of the voxels of a box that are not missing, the greatest possible one if there are none.
-    pub(super) fn least['a, T: Coded](of: View<'a, T>, code: Code<T>) -> T::Key = least_of;
+    pub(super) fn least['a, 'r, T: Coded](of: View<'a, T>, code: Code<'r, T>) -> T::Key = least_of;
+}
+
+/// Writes the keys of a row, and returns the greatest of them and `most`.
+#[inline(always)]
+pub(super) fn put_row<T: Coded>(row: &[T], key: impl Fn(T) -> T::Key, out: &mut [T::Key], mut most: T::Key) -> T::Key {
+    for (to, &v) in out.iter_mut().zip(row) {
+        *to = key(v);
+        most = most.max(*to);
+    }
+    most
 }
 
 #[inline(always)]
@@ -194,10 +249,8 @@ fn natural<T: Coded>(src: View<T>, code: Code<T>, out: &mut [T::Key]) -> T::Key 
         for y in 0..ny {
             let start = LANES + z * plane + y * row;
             out[written..start].fill(T::Key::ZERO);
-            for (to, &v) in out[start..][..nx].iter_mut().zip(src.row_at(z, y)) {
-                *to = code.key(v);
-                most = most.max(*to);
-            }
+            let to = &mut out[start..][..nx];
+            most = with_key!(code, key => put_row(src.row_at(z, y), key, to, most));
             written = start + nx;
         }
     }
@@ -205,27 +258,44 @@ fn natural<T: Coded>(src: View<T>, code: Code<T>, out: &mut [T::Key]) -> T::Key 
     most
 }
 
+/// A tile's part of a row along z, in the order `[x, z]`: what [`turn_rows`] hands on.
+pub(super) type Turned<K> = [[K; TURN]; 16];
+/// Voxels along z that are turned together.
+pub(super) const TURN: usize = 64;
+
+/// Keys with x and z exchanged: calls `put` with `[z0, y, x0]`, the number of voxels along z and x, and up to 16 rows along
+/// z, for pieces that cover the source.
 #[inline(always)]
-fn turned<T: Coded>(src: View<T>, code: Code<T>, out: &mut [T::Key]) {
-    const TILE: usize = 64;
+pub(super) fn turn_rows<T: Coded>(
+    src: View<T>,
+    code: Code<T>,
+    mut put: impl FnMut([usize; 3], [usize; 2], &Turned<T::Key>),
+) {
     let [nz, ny, nx] = src.shape;
-    let (row, plane) = strides([nx, ny, nz]);
-    out.fill(T::Key::ZERO);
     for y in 0..ny {
-        for z0 in (0..nz).step_by(TILE) {
-            let tz = TILE.min(nz - z0);
+        for z0 in (0..nz).step_by(TURN) {
+            let tz = TURN.min(nz - z0);
             for x0 in (0..nx).step_by(16) {
                 let tx = 16.min(nx - x0);
-                let mut tile = [[T::Key::ZERO; TILE]; 16];
+                let mut tile = [[T::Key::ZERO; TURN]; 16];
                 for z in 0..tz {
-                    for (to, &v) in tile.iter_mut().zip(&src.row_at(z0 + z, y)[x0..][..tx]) {
-                        to[z] = code.key(v);
-                    }
+                    let row = &src.row_at(z0 + z, y)[x0..][..tx];
+                    with_key!(code, key => tile.iter_mut().zip(row).for_each(|(to, &v)| to[z] = key(v)));
                 }
-                for (x, from) in tile[..tx].iter().enumerate() {
-                    out[LANES + (x0 + x) * plane + y * row + z0..][..tz].copy_from_slice(&from[..tz]);
-                }
+                put([z0, y, x0], [tz, tx], &tile);
             }
         }
     }
+}
+
+#[inline(always)]
+fn turned<T: Coded>(src: View<T>, code: Code<T>, out: &mut [T::Key]) {
+    let [nz, ny, nx] = src.shape;
+    let (row, plane) = strides([nx, ny, nz]);
+    out.fill(T::Key::ZERO);
+    turn_rows(src, code, |[z0, y, x0], [tz, tx], tile| {
+        for (x, from) in tile[..tx].iter().enumerate() {
+            out[LANES + (x0 + x) * plane + y * row + z0..][..tz].copy_from_slice(&from[..tz]);
+        }
+    });
 }

@@ -4,7 +4,8 @@
 //! |---|---|
 //! | `lines` | directions to families of lines, distances, fixed-point contributions |
 //! | `keys` | voxels to padded, order-preserving unsigned keys |
-//! | `driver` | tiles, sheets, senses |
+//! | `tiles` | tiles of an output box, their sums and results |
+//! | `driver` | sheets, senses |
 //! | `column`, `stream` | sweeps of boxes whose halos do not fit into memory |
 //! | `scan` | next greater key on 64 lines; `narrow`: by AVX2 or SSE2, `wide` and `turn`: by AVX-512 |
 //! | `sinks`, `contribute`, `weighted` | what is summed |
@@ -30,6 +31,7 @@ mod sinks;
 mod stream;
 #[cfg(test)]
 mod tests;
+mod tiles;
 #[cfg(target_arch = "x86_64")]
 mod turn;
 mod wanted;
@@ -37,19 +39,20 @@ mod weighted;
 #[cfg(target_arch = "x86_64")]
 mod wide;
 
+use std::convert::Infallible;
+
 use super::Context;
 use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::simd::Level;
 use crate::stage::{DirectionSet, DirectionWeights, Rho};
 use crate::with_view;
-use driver::{Buffers, FRAMES, in_frame};
-use keys::{Coded, Key, Volume};
+use driver::{FRAMES, in_frame};
+use keys::{Code, Coded, Key, Volume};
 use room::{Sizes, carve};
-use sinks::{OpenSum, Sink};
-use wanted::Wanted;
-use weighted::WeightedSum;
+use tiles::{Pass, Supply, tile_of};
 
 pub use lines::{is_valid_count, rho};
+pub use ranks::Ranks;
 pub use stream::Fetch;
 pub use wanted::LineCounts;
 
@@ -70,6 +73,9 @@ pub struct ObscuranceParams {
     pub missing: Option<i64>,
     /// Linear r, g, b seen where nothing occludes.
     pub ambient: [f64; 3],
+    /// Voxels are compared by these instead of their values: what is swept is a function of an 8- or 16-bit volume, such as
+    /// the opacity that a transfer table makes of it. The volume must have the type.
+    pub ranks: Option<Ranks>,
 }
 
 /// Directions, lines and tables made once from the parameters.
@@ -99,20 +105,6 @@ pub struct ObscuranceIo<'a> {
     pub openness: Option<AnyViewMut<'a>>,
     /// f32, the output box. Asks for `colour`.
     pub rgb: Option<[AnyViewMut<'a>; 3]>,
-}
-
-/// Output voxels whose sums are kept at once, `[z, y, x]`. Long lines waste less on halos than sums gain from a nearer
-/// cache: 2-core Zen 4 VM, AVX-512, 2026-11-26, u8, 42 directions, distance 64, bricks with halos of 64: `[256, 128, 256]`
-/// in one tile 0.76 ns per voxel and direction, `[128, 256, 256]` in two tiles 1.08. A sweep of one tile keeps one copy of
-/// the keys, so that 256^3 takes the bytes of two tiles of half the size.
-const TILE: Shape = [256; 3];
-/// The same for sums of 64 bits, of which there are up to five.
-const WEIGHTED_TILE: Shape = [128, 128, 256];
-
-/// Extents of a tile of an output box.
-fn tile_of(dst: Shape, weighted: bool) -> Shape {
-    let most = if weighted { WEIGHTED_TILE } else { TILE };
-    std::array::from_fn(|a| most[a].min(dst[a]))
 }
 
 impl Prepared {
@@ -219,178 +211,65 @@ impl Prepared {
         let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
         let (buffers, bytes) = sizes.buffers::<T::Key>(bytes);
 
-        let missing = keys::missing_of::<T>(self.params.missing);
-        let code = keys::Code { missing, flipped: self.params.flipped };
+        let code = Code::new(&self.params);
         let most = keys::encode(level, src, code, natural);
-        let at = src_box.offset_of(&dst_box);
-        // Nothing is greater than any voxel that is asked for.
-        let flat = keys::least(level, src.part(at, dst_box.shape()), code) >= most;
-        let encode = |frame: usize, out: &mut [T::Key]| match frame {
-            0 => _ = keys::encode(level, src, code, out),
-            _ => keys::encode_turned(level, src, code, out),
-        };
-        let mut pass = Pass {
-            prepared: self,
+        let mut copies = Copies {
             level,
-            flat,
-            keys: Keys {
-                shared: swapped.is_empty(),
-                copies: [natural, swapped],
-                hold: [Some(0), None],
-                encode: &encode,
-            },
-            src_box,
-            dst_box,
-            buffers,
-            masks: [natural_mask, turned_mask],
-            counts: LineCounts::default(),
+            src,
+            region: src_box,
+            code,
+            shared: swapped.is_empty(),
+            keys: [natural, swapped],
+            hold: [Some(0), None],
+            most,
+            least: T::Key::MAX,
         };
-        // NaN where a voxel of the row that starts at `p` is missing.
-        let gone = |p: [i64; 3], row: &mut [f32]| {
-            let [z, y, x] = [0, 1, 2].map(|a| (p[a] - src_box.lo[a]) as usize);
-            mark_missing(&src.row_at(z, y)[x..], missing, row);
-        };
-        pass.tiles(io, bytes, &gone);
+        let masks = [natural_mask, turned_mask];
+        let counts = LineCounts::default();
+        let mut pass = Pass { prepared: self, level, src_box, dst_box, buffers, masks, counts, flat: true };
+        let Ok(()) = pass.run::<Infallible>(io, &mut copies, bytes);
         pass.counts
     }
 }
 
-/// One sweep of one brick.
-struct Pass<'a, K> {
-    prepared: &'a Prepared,
+/// Padded copies of a source in the order of each frame. A sweep of one tile needs one after the other, in one place.
+struct Copies<'a, T: Coded> {
     level: Level,
-    /// Nothing is greater than anything.
-    flat: bool,
-    keys: Keys<'a, K>,
-    src_box: Region,
-    dst_box: Region,
-    buffers: Buffers<'a, K>,
-    /// For the needed voxels of a tile in both frames.
-    masks: [&'a mut [u64]; 2],
-    counts: LineCounts,
-}
-
-/// Padded copies of the source in the order of each frame. A sweep of one tile needs one after the other, in one place.
-struct Keys<'a, K> {
-    copies: [&'a mut [K]; 2],
+    src: View<'a, T>,
+    region: Region,
+    code: Code<'a, T>,
+    keys: [&'a mut [T::Key]; 2],
     shared: bool,
     /// The frame that each copy is in.
     hold: [Option<usize>; 2],
-    encode: &'a dyn Fn(usize, &mut [K]),
+    /// Greatest key of the source, and least of the tile.
+    most: T::Key,
+    least: T::Key,
 }
 
-impl<K> Keys<'_, K> {
-    fn in_frame(&mut self, frame: usize) -> &[K] {
+impl<T: Coded> Supply<T::Key, Infallible> for Copies<'_, T> {
+    fn enter(&mut self, tile: Region) {
+        let part = self.src.part(self.region.offset_of(&tile), tile.shape());
+        self.least = keys::least(self.level, part, self.code);
+    }
+
+    fn keys(&mut self, group: &[lines::Family], _: Region) -> Result<(Volume<'_, T::Key>, bool), Infallible> {
+        let frame = driver::frame_of(&group[0]);
         let place = if self.shared { 0 } else { frame };
-        if self.hold[place] != Some(frame) {
-            (self.encode)(frame, self.copies[place]);
+        let busy = self.most > self.least;
+        if busy && self.hold[place] != Some(frame) {
+            match frame {
+                0 => _ = keys::encode(self.level, self.src, self.code, self.keys[place]),
+                _ => keys::encode_turned(self.level, self.src, self.code, self.keys[place]),
+            }
             self.hold[place] = Some(frame);
         }
-        self.copies[place]
-    }
-}
-
-impl<K: Key> Pass<'_, K> {
-    fn tiles(&mut self, io: ObscuranceIo, bytes: &mut [u8], gone: &dyn Fn([i64; 3], &mut [f32])) {
-        let ObscuranceIo { colour, normal, needed, openness, rgb } = io;
-        let mut openness = openness.map(f32_view);
-        let mut rgb = rgb.map(|views| views.map(f32_view));
-        assert!(rgb.is_none() || colour.is_some(), "rgb needs colours");
-        let fast = openness.is_some() && normal.is_none();
-        let weighted = rgb.is_some() || normal.is_some();
-        let dst_box = self.dst_box;
-        let extents = tile_of(dst_box.shape(), weighted);
-        for cell in dst_box.cells(dst_box.lo, extents).iter() {
-            let tile = Region::of_cell(cell, dst_box.lo, extents).clip(&dst_box);
-            let tile = needed.map_or(tile, |mask| wanted::shrink(tile, mask, dst_box));
-            if tile.is_empty() {
-                continue;
-            }
-            let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
-            let len = |frame: usize| if fast { sinks::sums_len(tile.shape(), FRAMES[frame]) } else { 0 };
-            let (natural, rest) = carve::<u32>(&mut *bytes, len(0));
-            let (turned, rest) = carve::<u32>(rest, len(1));
-            let sums = [natural, turned];
-            let lens = FRAMES.map(|frame| sinks::sums_len(tile.shape(), frame));
-            let used = |yes: bool| if yes { lens } else { [0; 2] };
-            let (weights, rest) = weighted::pair(rest, used(normal.is_some()));
-            let (open, rest) = weighted::pair(rest, used(normal.is_some()));
-            let (red, rest) = weighted::pair(rest, used(rgb.is_some()));
-            let (green, rest) = weighted::pair(rest, used(rgb.is_some()));
-            let (blue, _) = weighted::pair(rest, used(rgb.is_some()));
-            let mut fast_sum = OpenSum { level: self.level, sums, tile };
-            fast_sum.clear();
-            let mut wide_sum = WeightedSum {
-                level: self.level,
-                tile,
-                dst_box,
-                src_box: self.src_box,
-                normal,
-                flipped: self.prepared.params.flipped,
-                uniform: self.prepared.uniform,
-                weights,
-                open,
-                ambient: self.prepared.params.ambient,
-                colour: colour.filter(|_| rgb.is_some()),
-                rgb: [red, green, blue],
-            };
-            wide_sum.clear();
-            match (fast, weighted) {
-                (true, false) if self.flat => {}
-                (true, false) => self.sweep_tile(tile, needed, &mut fast_sum),
-                (false, true) => self.sweep_tile(tile, needed, &mut wide_sum),
-                (true, true) => {
-                    let mut both = (fast_sum, wide_sum);
-                    self.sweep_tile(tile, needed, &mut both);
-                    (fast_sum, wide_sum) = both;
-                }
-                (false, false) => return,
-            }
-            if fast && !self.flat {
-                fast_sum.merge();
-            }
-            wide_sum.merge();
-            let total = self.prepared.total;
-            let [nz, ny, nx] = tile.shape();
-            let at = dst_box.offset_of(&tile);
-            for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-                let gone = |row: &mut [f32]| gone([tile.lo[0] + z as i64, tile.lo[1] + y as i64, tile.lo[2]], row);
-                if let Some(out) = &mut openness {
-                    let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
-                    match fast {
-                        true if self.flat => row.fill(1.0),
-                        true => fast_sum.openness([z, y], 0, total, row),
-                        false => wide_sum.openness([z, y], row),
-                    }
-                    gone(row);
-                }
-                for (c, out) in rgb.iter_mut().flatten().enumerate() {
-                    let row = &mut out.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx];
-                    wide_sum.colour_of([z, y], c, row);
-                    gone(row);
-                }
-            }
-        }
+        Ok((Volume::new(self.keys[place], in_frame(self.region, FRAMES[frame])), busy))
     }
 
-    fn sweep_tile<S: Sink>(&mut self, tile: Region, needed: Option<View<u8>>, sink: &mut S) {
-        let Pass { masks: [natural, turned], counts, .. } = self;
-        let wanted = needed.map(|needed| Wanted::both(needed, natural, turned));
-        for group in driver::groups(&self.prepared.families) {
-            let frame = driver::frame_of(&group[0]);
-            let volume = Volume::new(self.keys.in_frame(frame), in_frame(self.src_box, FRAMES[frame]));
-            let most = if self.flat { 0 } else { usize::MAX };
-            *counts += driver::sweep_group(
-                self.level,
-                group,
-                most,
-                volume,
-                tile,
-                wanted.map(|w| w[frame]),
-                &mut self.buffers,
-                sink,
-            );
-        }
+    fn mark_missing(&self, at: [i64; 3], row: &mut [f32]) {
+        let [z, y, x] = self.region.offset_of(&Region::new(at, at));
+        mark_missing(&self.src.row_at(z, y)[x..], self.code.missing, row);
     }
 }
 

@@ -1,9 +1,47 @@
-//! Floats of few distinct values as bytes. A sweep asks only which of two voxels is denser, so the rank of a value among those
-//! that occur serves as well as the value: opacities of 8-bit data, or of any data through a table with few steps, are swept
-//! as fast as bytes are.
+//! Ranks in the place of values. A sweep asks only which of two voxels is denser, so the rank of a value among those that
+//! occur serves as well: what a table makes of 8- or 16-bit data is swept as fast as the data ([`Ranks`], known before a
+//! voxel is read), and so are floats of few values, whatever made them ([`rank`], brick by brick).
 
-use super::keys::Coded;
+use std::sync::Arc;
+
+use super::keys::{Coded, Key};
 use crate::grid::View;
+
+/// Ranks of what a function makes of every value of an 8- or 16-bit type, by code: voxels are compared by the function's
+/// values while only their own are read. There are never more ranks than values, so that they fit the type's keys.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ranks(Arc<[u16]>);
+
+impl Ranks {
+    /// `values[i]`: what the function makes of the type's least value + `i`; 256 or 65536 of them. `None` if one is NaN.
+    ///
+    /// Panics if there are as many values as no type has.
+    pub fn new(values: &[f32]) -> Option<Ranks> {
+        assert!([1 << 8, 1 << 16].contains(&values.len()), "{} values", values.len());
+        if values.iter().any(|v| v.is_nan()) {
+            return None;
+        }
+        let mut order: Vec<(u32, usize)> = values.iter().enumerate().map(|(i, v)| (v.code(), i)).collect();
+        order.sort_unstable();
+        let mut ranks = vec![0; values.len()];
+        let mut rank = 0;
+        for (at, &(value, index)) in order.iter().enumerate() {
+            rank += u16::from(at > 0 && order[at - 1].0 != value);
+            ranks[index] = rank;
+        }
+        Some(Ranks(ranks.into()))
+    }
+
+    /// Whether they are those of a type with so many values.
+    pub(super) fn of<T>(&self) -> bool {
+        self.0.len() == 1 << (8 * size_of::<T>())
+    }
+
+    #[inline(always)]
+    pub(super) fn of_code<K: Key>(&self, code: K) -> K {
+        K::of_rank(self.0[code.index()])
+    }
+}
 
 /// Slots of the table of values, open addressed: four for each that it may hold.
 const SLOTS: usize = 1024;

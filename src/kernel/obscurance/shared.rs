@@ -2,7 +2,7 @@
 //! of this kernel, so that the bits are the same.
 
 use super::Prepared;
-use super::keys::{self, Coded};
+use super::keys::{self, Code, Coded, with_key};
 use super::lines::{self, Family};
 use crate::grid::{AnyView, DType, View};
 use crate::with_view;
@@ -56,11 +56,11 @@ impl Prepared {
     ///
     /// Panics on f64, or if the row is too short.
     pub fn codes(&self, src: AnyView, [z, y, x]: [usize; 3], out: &mut [u8]) -> (u32, u32) {
-        let (missing, flipped) = (self.params.missing, self.params.flipped);
+        let params = &self.params;
         macro_rules! arms {
             ($($t:ident: $bytes:literal),*) => {
                 match src {
-                    $(AnyView::$t(v) => row::<_, $bytes>(&v.row_at(z, y)[x..], missing, flipped, out, |k| k.to_le_bytes()),)*
+                    $(AnyView::$t(v) => row::<_, $bytes>(&v.row_at(z, y)[x..], Code::new(params), out, |k| k.to_le_bytes()),)*
                     AnyView::F64(_) => panic!("codes of f64 have 64 bits"),
                 }
             };
@@ -91,26 +91,18 @@ impl Prepared {
 
 fn row<T: Coded, const BYTES: usize>(
     row: &[T],
-    missing: Option<i64>,
-    flipped: bool,
+    code: Code<T>,
     out: &mut [u8],
     bytes: impl Fn(T::Key) -> [u8; BYTES],
 ) -> (u32, u32)
 where
     T::Key: Into<u32>,
 {
-    use keys::Key;
-    let missing = keys::missing_of::<T>(missing);
-    let (mut lo, mut hi) = (T::Key::MAX, T::Key::ZERO);
     let (out, _) = out.as_chunks_mut::<BYTES>();
     let row = &row[..out.len()];
-    for (out, &v) in out.iter_mut().zip(row) {
-        let gone = keys::is_missing(v, missing);
-        let key = if flipped { v.code().not() } else { v.code() };
-        lo = lo.min(if gone { T::Key::MAX } else { key });
-        let key = if gone { T::Key::ZERO } else { key };
-        hi = hi.max(key);
-        *out = bytes(key);
-    }
-    (lo.into(), hi.into())
+    with_key!(code, key => {
+        out.iter_mut().zip(row).for_each(|(out, &v)| *out = bytes(key(v)));
+        let (lo, hi) = keys::ends(row, &code, key);
+        (lo.into(), hi.into())
+    })
 }

@@ -22,6 +22,7 @@ fn params() -> ObscuranceParams {
         flipped: false,
         missing: None,
         ambient: [1.0; 3],
+        ranks: None,
     }
 }
 

@@ -9,7 +9,7 @@ use std::collections::HashMap;
 
 use super::graph::*;
 use super::{Prepass, lengths};
-use crate::config::{Config, Input, Modulation, Op, Place, Ref, StageNode, op_channels};
+use crate::config::{Config, Input, Modulation, ObscuranceOp, Op, Place, Ref, StageNode, op_channels};
 use crate::grid::Border;
 use crate::kernel::gaussian;
 use crate::store::VolumeInfo;
@@ -127,7 +127,11 @@ impl Lowering<'_> {
         for (key, input) in node.reads() {
             // A colour bleeds into the channel rgb alone.
             let unseen = if key == "colour" { first_rgb } else { first };
-            if unseen {
+            let by_ranks = |op: &ObscuranceOp| -> Result<bool> {
+                Ok(key == "input" && !op.weight_by_normal && self.ranked(input, &node.place)?.is_some())
+            };
+            let instead = matches!(&node.op, Op::Obscurance(op) if by_ranks(op)?);
+            if unseen && !instead {
                 self.want(input, &node.place)?;
             }
         }

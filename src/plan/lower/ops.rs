@@ -2,10 +2,12 @@
 
 use super::super::graph::*;
 use super::super::{Prepass, PrepassKind, lengths};
-use super::Lowering;
-use crate::config::{ObscuranceOp, Ref, StageNode};
-use crate::grid::Border;
-use crate::kernel::obscurance;
+use super::{Lowering, Target};
+use crate::brick::Voxels;
+use crate::config::{ObscuranceOp, Op, Place, Ref, StageNode};
+use crate::grid::{AnyViewMut, Border, ViewMut};
+use crate::kernel::values::store_any;
+use crate::kernel::{obscurance, pointwise};
 use crate::stage::{GradientWeight, WindowChannel, WindowParams};
 use crate::{Error, Result};
 
@@ -109,7 +111,10 @@ impl Lowering<'_> {
         op: &ObscuranceOp,
         wanted: &[&'static str],
     ) -> Result<()> {
-        let src = self.wire(&op.input, &node.place)?;
+        let (src, ranks) = match self.ranked(&op.input, &node.place)? {
+            Some((input, ranks)) => (self.input(input)?, Some(ranks)),
+            None => (self.wire(&op.input, &node.place)?, None),
+        };
         let max_distance =
             lengths::distance(&op.max_distance, self.lattice(src), &format!("{}.max_distance", node.place.key))?;
         let bleeds = wanted.contains(&"rgb");
@@ -129,8 +134,15 @@ impl Lowering<'_> {
                 format!("\"{name}\" has {} component(s); an rgb channel has 3", self.out.graph.wires[c].components),
             ));
         }
-        let normal = if op.weight_by_normal { Some(self.normal(index, node, src)?) } else { None };
+        let normal = if op.weight_by_normal {
+            let density = self.wire(&op.input, &node.place)?;
+            Some(self.normal(index, node, density)?)
+        } else {
+            None
+        };
         let wire = &self.out.graph.wires[src];
+        // Opacities are what they are, whichever way the stored values go.
+        let falling = ranks.is_none() && wire.affine.slope < 0.0;
         let params = obscurance::ObscuranceParams {
             directions: op.directions,
             set: op.set,
@@ -138,9 +150,10 @@ impl Lowering<'_> {
             rho: op.rho,
             max_distance,
             spacing: self.lattice(src).spacing,
-            flipped: op.solid_low != (wire.affine.slope < 0.0),
+            flipped: op.solid_low != falling,
             missing: wire.missing,
             ambient: op.ambient,
+            ranks,
         };
         let reach = obscurance::Prepared::new(&params).reach();
         let channels = wanted
@@ -150,6 +163,29 @@ impl Lowering<'_> {
         let inputs = [Some(src), colour, normal].into_iter().flatten().collect();
         let kind = StepKind::Obscurance { params, channels, colour, normal };
         self.push_step(index, node, kind, inputs, reach, Border::Clip, wanted)
+    }
+
+    /// A sweep of the opacity that a `transfer` makes of an 8- or 16-bit input reads that input, and compares voxels by the
+    /// ranks of their opacities: the input and the ranks. `None` for other densities, and for a table under a mask, whose
+    /// opacity is not a function of the voxel.
+    pub(super) fn ranked(&self, density: &Ref, place: &Place) -> Result<Option<(usize, obscurance::Ranks)>> {
+        let Target::Stage(stage, "opacity") = self.target(density, place)? else { return Ok(None) };
+        let node = &self.config.stages[stage];
+        let (Op::Transfer { input, points }, None) = (&node.op, &node.where_) else { return Ok(None) };
+        let Target::Input(input) = self.target(input, &node.place)? else { return Ok(None) };
+        let info = &self.infos[input];
+        if info.dtype.is_float() || info.dtype.size() > 2 || info.components > 1 {
+            return Ok(None);
+        }
+        let n = 1 << (8 * info.dtype.size());
+        let shape = [1, 1, n];
+        let all: Vec<f64> = (0..n).map(|i| info.dtype.range().0 + i as f64).collect();
+        let mut stored = Voxels::zeroed(info.dtype, n);
+        store_any(&mut stored.view_mut(shape), [0; 3], &all);
+        let mut opacity = vec![0.0; n];
+        let out = AnyViewMut::F32(ViewMut::dense(&mut opacity, shape));
+        pointwise::transfer((stored.view(shape), info.affine, None), points, Some(out), None);
+        Ok(obscurance::Ranks::new(&opacity).map(|ranks| (input, ranks)))
     }
 
     /// The 3^3 gradient (weight inverse) of the density, for `weight_by_normal`.

@@ -87,7 +87,7 @@ impl Lowering<'_> {
             border,
             mask,
             halo: [0; 3],
-            streamed: false,
+            streamed: None,
         };
         self.out.graph.steps.push(step);
         Ok(self.out.graph.steps.len() - 1)

@@ -13,10 +13,25 @@ pub(super) fn streamed<T: Coded>(
 where
     for<'a> AnyView<'a>: From<View<'a, T>>,
 {
+    with_normals(level, p, field, out, needed, None)
+}
+
+/// The same; `gradient` covers the output box.
+fn with_normals<T: Coded>(
+    level: Level,
+    p: &ObscuranceParams,
+    field: &Field<T>,
+    out: Region,
+    needed: Option<&[u8]>,
+    gradient: Option<&[Vec<f32>; 3]>,
+) -> Vec<f32>
+where
+    for<'a> AnyView<'a>: From<View<'a, T>>,
+{
     let prepared = Prepared::new(p);
     let own: Vec<T> = out.iter().map(|q| field.data[field.index(q).unwrap()]).collect();
     let mut openness = vec![-1f32; out.voxels()];
-    let asked = prepared.streamed_bytes(T::DTYPE, field.region.shape(), out.shape())
+    let asked = prepared.streamed_bytes(T::DTYPE, field.region.shape(), out.shape(), gradient.is_some())
         + needed.map_or(0, |_| prepared.masked_bytes(out.shape()));
     let mut scratch = Scratch::new();
     // What is left over from before must not matter.
@@ -39,12 +54,14 @@ where
     let dst = AnyViewMut::F32(ViewMut::dense(&mut openness, out.shape()));
     let mut cx = Context { level, scratch: &mut scratch };
     let needed = needed.map(|n| View::dense(n, out.shape()));
-    let done = prepared.sweep_streamed(view, out, field.region, needed, dst, &mut fetch, &mut cx).unwrap();
+    let normal = gradient.map(|g| [0, 1, 2].map(|c| View::dense(&g[c], out.shape())));
+    let io = ObscuranceIo { colour: None, normal, needed, openness: Some(dst), rgb: None };
+    let done = prepared.sweep_streamed(view, out, field.region, io, &mut fetch, &mut cx).unwrap();
     assert!(done.flat || done.lines.total > 0);
     assert!(scratch.bytes() <= asked.next_multiple_of(64), "{} bytes taken, {asked} promised", scratch.bytes());
     match needed {
-        None => assert_eq!(read, prepared.streamed_voxels(out, field.region)),
-        Some(_) => assert!(read <= prepared.streamed_voxels(out, field.region)),
+        None => assert_eq!(read, prepared.streamed_voxels(out, field.region, gradient.is_some())),
+        Some(_) => assert!(read <= prepared.streamed_voxels(out, field.region, gradient.is_some())),
     }
     openness
 }
@@ -107,6 +124,27 @@ fn columns_of_long_reach_and_many_tiles_give_the_same_bits() {
 }
 
 #[test]
+fn columns_weighed_by_normals_give_the_same_bits() {
+    // Wider than a tile of such sums along y; to the right a constant, where nothing is occluded.
+    let region = Region::whole([20, 150, 40]).shift([5, -9, 3]);
+    let mut data = mixed(region, 6);
+    region.iter().zip(&mut data).filter(|(p, _)| p[2] > 25).for_each(|(_, v)| *v = 7);
+    let field = Field { data: &data, region };
+    let mut noise = Noise(3);
+    let normals = [0, 1, 2].map(|_| region.iter().map(|_| (noise.next() % 5) as f32 - 2.0).collect::<Vec<f32>>());
+    let p = ObscuranceParams { max_distance: 12.0, flipped: true, ..params() };
+    for (lo, hi) in [([0, 0, 0], [20, 150, 40]), ([3, 9, 38], [9, 140, 40])] {
+        let out = Region::new(lo, hi).shift(region.lo);
+        let own = normals.each_ref().map(|n| out.iter().map(|q| n[field.index(q).unwrap()]).collect::<Vec<f32>>());
+        for level in Level::available() {
+            let want = sweep_part(level, &p, &field, out, None, Some(&normals)).openness;
+            let got = with_normals(level, &p, &field, out, None, Some(&own));
+            assert_eq!(bits(&got), bits(&want), "{out:?} {level:?}");
+        }
+    }
+}
+
+#[test]
 fn a_failed_fetch_ends_the_sweep() {
     let region = Region::whole([5, 6, 7]);
     let data = mixed(region, 5);
@@ -120,9 +158,8 @@ fn a_failed_fetch_ends_the_sweep() {
         left -= 1;
         if left == 0 { Err("gone") } else { Ok(()) }
     };
-    assert_eq!(
-        Prepared::new(&params()).sweep_streamed(view, region, region, None, dst, &mut fetch, &mut cx),
-        Err("gone")
-    );
+    let io = ObscuranceIo { colour: None, normal: None, needed: None, openness: Some(dst), rgb: None };
+    let prepared = Prepared::new(&params());
+    assert_eq!(prepared.sweep_streamed(view, region, region, io, &mut fetch, &mut cx), Err("gone"));
     assert_eq!(left, 0);
 }
