@@ -32,6 +32,14 @@ fn negated(a: vec2<u32>) -> vec2<u32> {
     return select(vec2<u32>(a.x, a.y ^ SIGN), a, is_nan64(a));
 }
 
+fn magnitude_of(a: vec2<u32>) -> vec2<u32> {
+    return vec2<u32>(a.x, a.y & ~SIGN);
+}
+
+fn with_sign(a: vec2<u32>, by: vec2<u32>) -> vec2<u32> {
+    return vec2<u32>(a.x, (a.y & ~SIGN) | (by.y & SIGN));
+}
+
 fn quiet(a: vec2<u32>) -> vec2<u32> {
     return vec2<u32>(a.x, a.y | 0x80000u);
 }

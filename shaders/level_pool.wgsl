@@ -55,7 +55,7 @@ fn voxel_at(z: u32, y: u32, x: u32) -> Cell {
     let v = widened(bits);
     var inner = v;
     if p.kind == SPREAD {
-        inner = product_of(v, v);
+        inner = product_of(v, magnitude_of(v));
     }
     return Cell(widened(mean), 1u, inner, vec2<u32>());
 }

@@ -59,7 +59,7 @@ fn value(cell: Cell) -> vec2<u32> {
     }
     let variance = sum_of(share, quotient_of(cell.between, n));
     if p.kind == SPREAD {
-        return root_of(variance);
+        return with_sign(root_of(magnitude_of(variance)), variance);
     }
     return variance;
 }

@@ -5,7 +5,7 @@ use super::passes::{self, Job, Part, Quantity};
 use super::record::{Bind, Buffer, Shader};
 use super::recorder::{Planes, Recorder};
 use crate::grid::Affine;
-use crate::kernel::window::finish::Width;
+use crate::kernel::window::Width;
 use crate::stage::{Method, Ties, WindowChannel, WindowParams};
 
 /// Most channels of one dispatch.

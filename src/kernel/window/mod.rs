@@ -16,7 +16,6 @@ mod estimate;
 mod exact;
 mod extremes;
 mod far;
-pub mod finish;
 pub mod finish_floats;
 mod float;
 mod float_estimate;
@@ -35,6 +34,7 @@ pub mod reference;
 mod tests;
 
 use emit::Emit;
+pub use estimate::Width;
 use int::Dispatch;
 pub use plan::Needs;
 use plan::{Job, Plain};
