@@ -8,6 +8,7 @@ use crate::grid::Voxel;
 use crate::stage::directions;
 
 mod masked;
+mod metamorphic;
 mod ranked;
 mod streamed;
 
@@ -405,51 +406,6 @@ fn flat_bricks_are_open_and_see_the_ambient_colour() {
     for i in (0..data.len()).filter(|&i| other.openness[i] == 1.0) {
         (0..3).for_each(|c| assert_eq!(got.rgb[c][i].to_bits(), other.rgb[c][i].to_bits()));
         assert!((got.rgb[0][i] - 0.3).abs() < 1e-6);
-    }
-}
-
-#[test]
-fn increasing_maps_change_nothing_and_negation_equals_flipping() {
-    let region = Region::whole([11, 12, 20]);
-    let data = mixed(region, 21);
-    let plain = bits(&sweep(&params(), &Field { data: &data, region }));
-    let mapped: Vec<f64> = data.iter().map(|&v| (v as f64 * 0.2).exp() - 1e9).collect();
-    assert_eq!(bits(&sweep(&params(), &Field { data: &mapped, region })), plain);
-    let negative: Vec<i16> = data.iter().map(|&v| -(v as i16)).collect();
-    let flipped = ObscuranceParams { flipped: true, ..params() };
-    assert_eq!(bits(&sweep(&flipped, &Field { data: &negative, region })), plain);
-}
-
-#[test]
-fn cyclic_permutation_of_the_axes_permutes_the_result() {
-    for directions in [42, 162] {
-        let n = 23;
-        let region = Region::whole([n; 3]);
-        let data = mixed(region, 33);
-        let p = ObscuranceParams { directions, max_distance: 12.0, ..params() };
-        let index = |[z, y, x]: [i64; 3]| ((z * n as i64 + y) * n as i64 + x) as usize;
-        let turned: Vec<u8> = region.iter().map(|[z, y, x]| data[index([y, x, z])]).collect();
-        let a = sweep(&p, &Field { data: &data, region });
-        let b = sweep(&p, &Field { data: &turned, region });
-        for [z, y, x] in region.iter() {
-            assert_eq!(b[index([z, y, x])].to_bits(), a[index([y, x, z])].to_bits());
-        }
-    }
-}
-
-#[test]
-fn a_longer_reach_never_opens() {
-    let region = Region::whole([14, 15, 33]);
-    let data = mixed(region, 40);
-    for rho in [Rho::Step, Rho::Linear, Rho::Exponential, Rho::Sqrt] {
-        let mut last = vec![1f32; data.len()];
-        for max_distance in [0.5, 1.0, 2.0, 5.5, 11.0, 30.0] {
-            let p = ObscuranceParams { rho, max_distance, ..params() };
-            let next = sweep(&p, &Field { data: &data, region });
-            assert!(next.iter().zip(&last).all(|(n, l)| n <= l), "{rho:?} {max_distance}");
-            last = next;
-        }
-        assert!(last.iter().any(|v| *v < 0.9));
     }
 }
 
