@@ -27,17 +27,13 @@ impl Gpu {
         affine: Affine,
     ) -> Result<(Vec<Moments>, Times), GpuError> {
         facts::occlusion_map(src.dtype(), false).map_err(|e| GpuError(e.into()))?;
-        let read = job.boxes(brick)[0];
-        assert!(src_box.contains(&read), "voxels {read:?} are needed, {src_box:?} are given");
         let parts = job.parts(brick, self.cap()).ok_or_else(|| GpuError("a cell does not fit its buffers".into()))?;
         self.attempt(|device| {
             let mut times = Times::default();
             let mut levels: Vec<Moments> = (1..job.levels()).map(|k| room(job.own(k, brick).voxels())).collect();
             for &part in &parts {
                 let boxes = job.boxes(part);
-                let shape = boxes[0].shape();
-                let seen = Part { lo: [0; 3], dst: shape, from: src_box.offset_of(&boxes[0]), src: shape };
-                let pitch = job.pitch(boxes[0]) * job.voxel;
+                let (seen, pitch) = read(job, boxes[0], src_box);
                 let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, pitch, out);
                 let mut done = |bytes: Option<&[u8]>| {
                     for (k, to) in (1..).zip(&mut levels) {
@@ -90,9 +86,7 @@ impl Gpu {
             };
             for &part in &parts {
                 let boxes = job.boxes(part);
-                let shape = boxes[0].shape();
-                let seen = Part { lo: [0; 3], dst: shape, from: src_box.offset_of(&boxes[0]), src: shape };
-                let pitch = job.pitch(boxes[0]) * job.voxel;
+                let (seen, pitch) = read(job, boxes[0], src_box);
                 let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, pitch, out);
                 let (recording, places, last) = job.recorded(part, Some(codes));
                 let mut done = |bytes: Option<&[u8]>| {
@@ -115,6 +109,14 @@ impl Gpu {
             Ok(made)
         })
     }
+}
+
+/// What a part reads of `src_box`, and the bytes of its rows as they are packed.
+fn read(job: &MapJob, wanted: Region, src_box: Region) -> (Part, usize) {
+    assert!(src_box.contains(&wanted), "voxels {wanted:?} are needed, {src_box:?} are given");
+    let shape = wanted.shape();
+    let seen = Part { lo: [0; 3], dst: shape, from: src_box.offset_of(&wanted), src: shape };
+    (seen, job.pitch(wanted) * job.voxel)
 }
 
 fn room(cells: usize) -> Moments {

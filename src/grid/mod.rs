@@ -6,6 +6,7 @@ pub mod affine;
 pub mod any;
 pub mod border;
 pub mod dtype;
+pub mod hash;
 pub mod order;
 pub mod region;
 pub mod view;

@@ -1,6 +1,7 @@
 //! Hostile volumes for tests: noise with runs of constants, extremes of the type, and for floats NaN, infinities, -0.0.
 
 use crate::brick::Voxels;
+use crate::grid::hash::mix;
 use crate::grid::{DType, Shape, Voxel};
 use crate::with_voxels;
 
@@ -10,10 +11,7 @@ pub(crate) struct Noise(pub u64);
 impl Noise {
     pub fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+        mix(self.0)
     }
 
     pub fn below(&mut self, n: usize) -> usize {

@@ -12,7 +12,6 @@ use crate::gpu::points::{self, Op};
 use crate::gpu::slopes::Fit;
 use crate::gpu::taps::Wanted;
 use crate::grid::{Border, DType, Region, Shape};
-use crate::kernel::convert::Mapping;
 use crate::stage::Reduce;
 
 /// Steps over one wire.
@@ -207,10 +206,7 @@ pub struct Site<'a> {
 pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Target>)> {
     let graph = &plan.graph;
     let steps: Vec<StepId> = flow.steps.iter().copied().filter(|s| site.steps.contains(s)).collect();
-    let at = |w: WireId| match graph.wires[w].producer {
-        Producer::Step(p) => steps.iter().position(|&s| s == p),
-        Producer::Input(_) => None,
-    };
+    let at = |w| maker(graph, &steps, w);
     let input = |w: WireId, component: usize| match at(w) {
         None => Input::Source,
         Some(step) => {
@@ -253,6 +249,14 @@ pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Tar
     (!flow.sinks.is_empty()).then_some((flow, targets))
 }
 
+/// Which of these steps makes a wire.
+fn maker(graph: &Graph, steps: &[StepId], w: WireId) -> Option<usize> {
+    match graph.wires[w].producer {
+        Producer::Step(p) => steps.iter().position(|&s| s == p),
+        Producer::Input(_) => None,
+    }
+}
+
 /// The components of outputs whose levels the device makes of a wire.
 fn levels_of(plan: &Plan, outputs: &[usize], w: WireId, at: &dyn Fn(WireId) -> Option<usize>) -> Vec<(usize, usize)> {
     let parts = outputs.iter().flat_map(|&o| (0..plan.outputs[o].parts.len()).map(move |c| (o, c)));
@@ -284,10 +288,7 @@ fn comes_back(plan: &Plan, site: &Site, steps: &[StepId], w: WireId, at: &dyn Fn
 pub fn voxels_come_back(plan: &Plan, flow: &FlowPlan, group: &Group, w: WireId) -> bool {
     let (steps, outputs) = (&group.steps[..], &group.outputs[..]);
     let site = Site { steps, outputs, volume: group.shape, brick: Region::whole([0; 3]), globals: &[] };
-    let at = |w: WireId| match plan.graph.wires[w].producer {
-        Producer::Step(p) => flow.steps.iter().position(|&s| s == p),
-        Producer::Input(_) => None,
-    };
+    let at = |w| maker(&plan.graph, &flow.steps, w);
     comes_back(plan, &site, &flow.steps, w, &at)
 }
 
@@ -295,7 +296,7 @@ fn pyramid(output: &OutputPlan, component: usize, range: Option<[f64; 2]>) -> Py
     let levels = 1..=output.brick_level();
     Pyramid {
         dtype: output.spec.dtype,
-        mapping: Mapping { range, fill: output.missing(component, range) },
+        mapping: output.mapping(component, range),
         reduce: output.reduce,
         std: output.is_std,
         halved: levels.map(|k| output.level(k).expect("level exists").halved).collect(),

@@ -5,6 +5,7 @@ use super::lower::Lowered;
 use super::{Prepass, PrepassKind};
 use crate::config::{Config, Op, Output, OutputDType, OutputFormat, OutputRange, op_channels};
 use crate::grid::{DType, Region};
+use crate::kernel::convert::Mapping;
 use crate::stage::Reduce;
 use crate::store::{Pyramid, SinkSpec, VolumeInfo};
 use crate::{Error, Result};
@@ -354,6 +355,11 @@ fn code(dtype: DType, value: f64, range: Option<[f64; 2]>) -> f64 {
 }
 
 impl OutputPlan {
+    /// How values of a component become the output's type, once the range is known.
+    pub fn mapping(&self, component: usize, range: Option<[f64; 2]>) -> Mapping {
+        Mapping { range, fill: self.missing(component, range) }
+    }
+
     /// What missing voxels of a component hold, once the range is known.
     pub fn missing(&self, component: usize, range: Option<[f64; 2]>) -> f64 {
         match self.fills.get(component) {

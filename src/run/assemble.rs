@@ -208,8 +208,7 @@ impl Assembler<'_> {
     }
 
     pub fn mapping(&self, place: &Place) -> Mapping {
-        let range = place.target.range;
-        Mapping { range, fill: place.output.missing(place.component, range) }
+        place.output.mapping(place.component, place.target.range)
     }
 
     /// Converts unrounded values to the output's type and puts them.

@@ -8,7 +8,6 @@ use crate::gpu::MapLevels;
 use crate::gpu::maps::MapCodes;
 use crate::grid::{AnyView, Region, View};
 use crate::kernel::Context;
-use crate::kernel::convert::Mapping;
 use crate::kernel::occlusion_map::{Moments, base, coarsen, needed};
 use crate::plan::{MapPlan, OutputPlan};
 use crate::{Error, Result};
@@ -93,7 +92,7 @@ fn on_gpu(
         first: map.first,
         moments: map.moments.clone(),
         dtype: output.spec.dtype,
-        mapping: Mapping { range: target.range, fill: output.spec.fill },
+        mapping: output.mapping(0, target.range),
         affine: plan.graph.wires[map.source].affine,
         cells: target.cells.is_some(),
     };

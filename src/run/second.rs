@@ -11,7 +11,7 @@ use crate::Result;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{AnyView, Region, View};
 use crate::kernel::Context;
-use crate::kernel::convert::{Mapping, convert_at};
+use crate::kernel::convert::convert_at;
 use crate::kernel::occlusion_map::{Moments, coarsen, needed};
 use crate::kernel::reduce::{Cells, planes};
 use crate::kernel::simd::Level;
@@ -118,7 +118,7 @@ fn cells_chunk(
         source.load(output.reduce, output.is_std, below.factor, extent, &data);
         cells.next_from(&source, layout.halved, &mut cx);
         let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
-        cells.write([0; 3], mapping(output, target, component), rounded.view_mut(region.shape()), &mut cx);
+        cells.write([0; 3], output.mapping(component, target.range), rounded.view_mut(region.shape()), &mut cx);
         bytes += store(output, target, k, component, region, &rounded)?;
         let mut stored = Vec::new();
         cells.store(&mut stored);
@@ -151,17 +151,13 @@ fn map_chunk(
         let values = if which == 0 { &made.mean } else { &made.variance };
         let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
         let view = AnyView::F64(View::dense(values, region.shape()));
-        convert_at(Level::detect(), view, mapping(output, target, component), rounded.view_mut(region.shape()));
+        convert_at(Level::detect(), view, output.mapping(component, target.range), rounded.view_mut(region.shape()));
         bytes += store(output, target, k, component, region, &rounded)?;
     }
     for (plane, values) in [&made.mean, &made.variance].into_iter().enumerate() {
         next.write(plane, region, as_bytes(&dense(values, region, region)));
     }
     Ok(bytes)
-}
-
-fn mapping(output: &OutputPlan, target: &Target, component: usize) -> Mapping {
-    Mapping { range: target.range, fill: output.missing(component, target.range) }
 }
 
 fn store(

@@ -6,6 +6,7 @@ use std::sync::Mutex;
 
 use super::compute::Finished;
 use super::value::Comp;
+use crate::grid::hash::mix;
 use crate::grid::{DType, Region, Shape, View, Voxel};
 use crate::kernel::levels::{Levels, MOST_LEVELS};
 use crate::plan::Plan;
@@ -47,10 +48,7 @@ fn nothing(dtype: DType) -> Found {
 
 /// SplitMix64 of a row's place.
 fn hash(z: i64, y: i64) -> u64 {
-    let mut h = (z as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (y as u64).wrapping_mul(0xd1b5_4a32_d192_ed03);
-    h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    h = (h ^ (h >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    h ^ (h >> 31)
+    mix((z as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (y as u64).wrapping_mul(0xd1b5_4a32_d192_ed03))
 }
 
 impl Sketch {

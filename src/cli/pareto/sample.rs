@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 
 use super::super::human;
 use crate::config::Sample;
+use crate::grid::hash::mix;
 use crate::grid::{Region, Shape};
 
 /// Edge of a judged brick: whole chunks of the outputs of a run.
@@ -32,12 +33,7 @@ fn grid(shape: Shape) -> [u64; 3] {
 
 /// SplitMix64 of the seed and a brick's place in the grid.
 fn hash(seed: u64, cell: [u64; 3]) -> u64 {
-    cell.into_iter().chain([0]).fold(seed, |h, v| {
-        let mut h = (h ^ v).wrapping_add(0x9e37_79b9_7f4a_7c15);
-        h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        h = (h ^ (h >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        h ^ (h >> 31)
-    })
+    cell.into_iter().chain([0]).fold(seed, |h, v| mix((h ^ v).wrapping_add(0x9e37_79b9_7f4a_7c15)))
 }
 
 impl Judged {

@@ -77,7 +77,7 @@ impl Encoder {
             if self.codec == Codec::None {
                 return Ok(Encoded::Bytes(raw));
             }
-            self.buffers.lock().unwrap_or_else(|e| e.into_inner()).push(raw);
+            self.reuse(raw);
             encoded.map(Encoded::Bytes)
         })
     }

@@ -5,6 +5,7 @@
 use std::f64::consts::TAU;
 
 use crate::config::Input;
+use crate::grid::hash::mix;
 use crate::grid::{AnyViewMut, DType, Region, Shape, ViewMut, Voxel};
 use crate::store::VolumeInfo;
 use crate::{Error, Result, with_view};
@@ -75,11 +76,6 @@ pub fn open(input: &Input, name: &str, shape: Shape, dtype: DType, seed: u64) ->
 
 /// A well-mixed 64-bit hash of two numbers (splitmix64's finaliser, applied to each).
 fn hash(seed: u64, index: u64) -> u64 {
-    let mix = |mut v: u64| {
-        v = (v ^ v >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        v = (v ^ v >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        v ^ v >> 31
-    };
     mix(mix(seed.wrapping_add(0x9e37_79b9_7f4a_7c15)) ^ index.wrapping_mul(0x9e37_79b9_7f4a_7c15))
 }
 
