@@ -1,67 +1,85 @@
 //! Voxels as codes: how many levels lie below each.
 
 use super::MOST_LEVELS;
-use super::choose::{Levels, PARTS};
+use super::choose::Levels;
+use super::search;
 use super::sums::NEVER;
 use crate::grid::Voxel;
+use crate::kernel::simd::Level;
 use crate::multiversion;
 
 /// A type whose voxels are compared with levels.
 pub(crate) trait Coded: Voxel {
     /// As wide as the voxel, so that a comparison's result needs no widening.
     type Count: Copy + Default + std::ops::AddAssign + From<bool> + Into<u64>;
+    /// Values of the type, where a table of their codes is the faster way.
+    const VALUES: usize;
+    /// Place in that table, ascending with the value.
+    fn place(self) -> usize;
+    /// Writes the codes of a row by a search in registers; false where there is none (see [`search`]).
+    fn search(_level: Level, _row: &[Self], _levels: &[Self], _flipped: bool, _codes: &mut [u8]) -> bool {
+        false
+    }
 }
 
 macro_rules! coded {
-    ($($t:ty: $count:ty),*) => {$(impl Coded for $t { type Count = $count; })*};
+    ($($t:ty: $count:ty, $values:expr, $place:expr $(, $search:expr)?;)*) => {$(
+        impl Coded for $t {
+            type Count = $count;
+            const VALUES: usize = $values;
+            #[inline(always)]
+            fn place(self) -> usize { ($place)(self) }
+            $(
+                #[inline(always)]
+                fn search(level: Level, row: &[Self], levels: &[Self], flipped: bool, codes: &mut [u8]) -> bool {
+                    ($search)(level, row, levels, flipped, codes)
+                }
+            )?
+        }
+    )*};
 }
-coded!(u8: u8, i8: u8, u16: u16, i16: u16, u32: u32, i32: u32, f32: u32, f64: u64);
+coded! {
+    u8: u8, 1 << 8, |v: u8| usize::from(v);
+    i8: u8, 1 << 8, |v: i8| usize::from(v as u8 ^ 0x80);
+    u16: u16, 1 << 16, |v: u16| usize::from(v), |level, row, levels, flipped, codes| {
+        search::words(level, row, levels, if flipped { 0x7fff } else { 0x8000 }, codes)
+    };
+    i16: u16, 1 << 16, |v: i16| usize::from(v as u16 ^ 0x8000), |level, row, levels, flipped, codes| {
+        search::words(level, as_u16(row), as_u16(levels), if flipped { 0xffff } else { 0 }, codes)
+    };
+    u32: u32, 0, |_| 0;
+    i32: u32, 0, |_| 0;
+    f32: u32, 0, |_| 0, search::floats;
+    f64: u64, 0, |_| 0;
+}
 
-/// Levels as a kernel reads them.
-pub(crate) struct Table<T> {
-    levels: usize,
+/// The same bits.
+fn as_u16(v: &[i16]) -> &[u16] {
+    // SAFETY: both have the same size and alignment, and every bit pattern is a number of either.
+    unsafe { std::slice::from_raw_parts(v.as_ptr().cast(), v.len()) }
+}
+
+/// Stored values of the levels, from the least dense on.
+pub(crate) struct Stored<T> {
+    count: usize,
     pub flipped: bool,
-    /// Stored values of the levels, from the least dense on.
     at: [T; MOST_LEVELS],
     step: [bool; MOST_LEVELS + 1],
-    /// Stored value of the level before, and the way from it, negative where the order is turned; by code.
-    base: [f64; MOST_LEVELS + 1],
-    span: [f64; MOST_LEVELS + 1],
-    /// Share of an interval that one code of an integer type is; 0 for floats.
-    unit: [f64; MOST_LEVELS + 1],
-    /// Share of an interval's voxels up to each part of the way through it.
-    rise: [[f64; PARTS + 1]; MOST_LEVELS + 1],
 }
 
-impl<T: Coded> Table<T> {
-    pub fn new(levels: &Levels, flipped: bool) -> Table<T> {
-        let n = levels.at.len();
-        let stored = |k: usize| if flipped { -levels.at[k] } else { levels.at[k] };
-        let mut table = Table {
-            levels: n,
-            flipped,
-            at: [T::default(); MOST_LEVELS],
-            step: [true; MOST_LEVELS + 1],
-            base: [0.0; MOST_LEVELS + 1],
-            span: [1.0; MOST_LEVELS + 1],
-            unit: [0.0; MOST_LEVELS + 1],
-            rise: [[0.0; PARTS + 1]; MOST_LEVELS + 1],
-        };
-        for k in 0..n {
-            table.at[k] = T::from_f64(stored(k));
-            table.step[k] = k == 0 || levels.step[k];
-            if !table.step[k] {
-                table.base[k] = stored(k - 1);
-                table.span[k] = stored(k) - stored(k - 1);
-                table.rise[k][1..].copy_from_slice(&levels.rise[k]);
-                table.unit[k] = if T::DTYPE.is_float() { 0.0 } else { 1.0 / table.span[k].abs() };
-            }
+impl<T: Coded> Stored<T> {
+    pub fn new(levels: &Levels, flipped: bool) -> Stored<T> {
+        let count = levels.at.len();
+        let mut stored = Stored { count, flipped, at: [T::default(); MOST_LEVELS], step: [true; MOST_LEVELS + 1] };
+        for (k, at) in levels.at.iter().enumerate() {
+            stored.at[k] = T::from_f64(if flipped { -at } else { *at });
+            stored.step[k] = k == 0 || levels.step[k];
         }
-        table
+        stored
     }
 
-    pub fn levels(&self) -> usize {
-        self.levels
+    pub fn levels(&self) -> &[T] {
+        &self.at[..self.count]
     }
 
     /// Whether no value lies strictly between the code's level and the one before.
@@ -69,35 +87,25 @@ impl<T: Coded> Table<T> {
         self.step[code.min(MOST_LEVELS)]
     }
 
-    /// How far `v` lies on the way from the level before its code's to that level.
-    #[inline(always)]
-    pub fn way(&self, v: T, code: u8) -> f64 {
-        let code = usize::from(code).min(MOST_LEVELS);
-        (v.to_f64() - self.base[code]) / self.span[code]
-    }
-
-    /// Share of the interval's voxels up to there; 1 at the level and where there is nothing in between.
-    #[inline(always)]
-    pub fn weight(&self, way: f64, code: u8) -> f64 {
-        let code = usize::from(code).min(MOST_LEVELS);
-        if self.step[code] { 1.0 } else { self.risen(way, code) }
-    }
-
-    /// The same for the values below.
-    #[inline(always)]
-    pub fn weight_below(&self, way: f64, code: u8) -> f64 {
-        let code = usize::from(code).min(MOST_LEVELS);
-        if self.step[code] { 0.0 } else { self.risen(way - self.unit[code], code) }
-    }
-
-    /// Linear in each part; exact at both ends.
-    #[inline(always)]
-    fn risen(&self, way: f64, code: usize) -> f64 {
-        // Not a number, where the span overflowed, is the start.
-        let place = (way * PARTS as f64).max(0.0);
-        let part = (place as usize).min(PARTS - 1);
-        let share = place - part as f64;
-        self.rise[code][part] * (1.0 - share) + self.rise[code][part + 1] * share
+    /// Codes of all values of the type; `table` has [`Coded::VALUES`] elements.
+    pub fn fill_table(&self, table: &mut [u8]) {
+        let places = self.levels().iter().map(|v| v.place()).enumerate();
+        table.fill(self.count as u8);
+        if T::VALUES == 0 {
+            return;
+        }
+        // Values above the level before, up to the level.
+        if self.flipped {
+            places.fold(T::VALUES, |end, (k, at)| {
+                table[at..end].fill(k as u8);
+                at
+            });
+        } else {
+            places.fold(0, |start, (k, at)| {
+                table[start..=at].fill(k as u8);
+                at + 1
+            });
+        }
     }
 }
 
@@ -109,35 +117,79 @@ pub(super) fn gone<T: Voxel>(v: T, missing: Option<T>) -> bool {
     nan || missing == Some(v)
 }
 
+/// What the codes of a box hold beside levels.
+#[derive(Default, Clone, Copy)]
+pub(super) struct Seen {
+    /// Missing voxels.
+    pub gaps: bool,
+    /// Voxels above every level.
+    pub above: bool,
+}
+
+/// Codes of a row: levels below each voxel in the order of density, [`NEVER`] for a missing one. `table` holds the codes of
+/// all values or is empty.
+pub(super) fn fill_codes<T: Coded>(
+    level: Level,
+    row: &[T],
+    missing: Option<T>,
+    stored: &Stored<T>,
+    table: &[u8],
+    codes: &mut [u8],
+    seen: &mut Seen,
+) {
+    let found = T::search(level, row, stored.levels(), stored.flipped, codes);
+    match (found, T::VALUES) {
+        (true, _) => {}
+        (false, 0) => count_levels(level, row, stored, codes),
+        (false, values) => {
+            // Not compiled for vectors, which would gather: plain loads are the faster way.
+            let table = &table[..values];
+            codes.iter_mut().zip(row).for_each(|(code, v)| *code = table[v.place()]);
+        }
+    }
+    see(level, row, missing, stored.count as u8, codes, seen);
+}
+
 multiversion! {
-    /// Codes of a row: levels below each voxel in the order of density, [`NEVER`] for a missing one. Returns whether any is.
-    pub(super) fn fill_codes[T: Coded](row: &[T], missing: Option<T>, table: &Table<T>, codes: &mut [u8]) -> bool = fill_inner;
+    /// Marks missing voxels.
+    fn see[T: Coded](row: &[T], missing: Option<T>, top: u8, codes: &mut [u8], seen: &mut Seen) -> () = see_inner;
 }
 
 #[inline(always)]
-fn fill_inner<T: Coded>(row: &[T], missing: Option<T>, table: &Table<T>, codes: &mut [u8]) -> bool {
+fn see_inner<T: Coded>(row: &[T], missing: Option<T>, top: u8, codes: &mut [u8], seen: &mut Seen) {
+    if missing.is_some() || T::DTYPE.is_float() {
+        let mut gaps = false;
+        for (code, v) in codes.iter_mut().zip(row) {
+            let lost = gone(*v, missing);
+            *code = if lost { NEVER } else { *code };
+            gaps |= lost;
+        }
+        seen.gaps |= gaps;
+    }
+    seen.above |= codes.iter().fold(false, |above, code| above | (*code == top));
+}
+
+multiversion! {
+    /// Levels below each voxel, by comparing it with all.
+    fn count_levels[T: Coded](row: &[T], stored: &Stored<T>, codes: &mut [u8]) -> () = count_levels_inner;
+}
+
+#[inline(always)]
+fn count_levels_inner<T: Coded>(row: &[T], stored: &Stored<T>, codes: &mut [u8]) {
     const RUN: usize = 64;
-    let mut any = false;
     for (row, codes) in row.chunks(RUN).zip(codes.chunks_mut(RUN)) {
         let mut values = [T::default(); RUN];
         values[..row.len()].copy_from_slice(row);
         let mut counts = [T::Count::default(); RUN];
-        if table.flipped {
-            for level in &table.at[..table.levels] {
+        if stored.flipped {
+            for level in stored.levels() {
                 counts.iter_mut().zip(&values).for_each(|(c, v)| *c += T::Count::from(*level > *v));
             }
         } else {
-            for level in &table.at[..table.levels] {
+            for level in stored.levels() {
                 counts.iter_mut().zip(&values).for_each(|(c, v)| *c += T::Count::from(*level < *v));
             }
         }
         codes.iter_mut().zip(&counts).for_each(|(to, c)| *to = (*c).into() as u8);
-        if missing.is_some() || T::DTYPE.is_float() {
-            for (code, _) in codes.iter_mut().zip(row).filter(|(_, v)| gone(**v, missing)) {
-                *code = NEVER;
-                any = true;
-            }
-        }
     }
-    any
 }

@@ -3,21 +3,28 @@
 
 mod choose;
 mod codes;
+mod counts;
 pub mod reference;
+mod search;
+mod slopes;
 pub(crate) mod sums;
 mod vector;
 
 pub use choose::{Levels, PARTS};
 
+use std::ops::Range;
+
 use super::Context;
 use super::simd::Level;
 use super::values::missing_as;
 use crate::brick::scratch::{cut, padded};
-use crate::grid::{AnyView, AnyViewMut, DType, Shape, View};
+use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{Ties, WindowParams};
-use crate::{multiversion, with_view};
-use codes::{Coded, Table, fill_codes, gone};
-use sums::{NEVER, Row, Sum, Tile, Work, sweep};
+use crate::{with_dtype, with_view};
+use codes::{Coded, Seen, Stored, fill_codes, gone};
+use counts::{All, Counts, Lanes, count_row};
+use slopes::{Slopes, interpolate};
+use sums::{NEVER, RUN, Sum, Tile, Windows, Work, sweep};
 
 /// Most levels of a volume.
 pub const MOST_LEVELS: usize = 64;
@@ -51,44 +58,85 @@ pub fn levels(
     let bytes = cx.scratch.take(scratch_bytes(src.dtype(), from, to, params));
     let radius: [usize; 3] = std::array::from_fn(|a| params.radius[a].min(from[a] - 1));
     with_view!(AnyView, src, v => {
-        let (table, missing) = (Table::new(levels, params.flipped()), missing_as(params.missing));
+        let rule = Rule::new(levels, params, ties);
+        let (table, bytes) = cut::<u8>(bytes, rule.values());
+        rule.stored.fill_table(table);
         for (lo, first, tile) in Tile::all(from, to, at, radius, TILE) {
-            one_tile(cx.level, v.part(first, tile.src), missing, &table, &tile, ties, bytes, lo, &mut dst);
+            one_tile(cx.level, v.part(first, tile.src), &rule, table, &tile, bytes, lo, &mut dst);
         }
     });
 }
 
 /// Bytes of scratch that [`levels`] takes at most.
-pub fn scratch_bytes(_dtype: DType, src: Shape, dst: Shape, params: &WindowParams) -> usize {
+pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams) -> usize {
     let dst: Shape = std::array::from_fn(|a| TILE[a].min(dst[a]));
     let src: Shape = std::array::from_fn(|a| dst[a].saturating_add(params.radius[a].saturating_mul(2)).min(src[a]));
     let tile = Tile { src, dst, at: [0; 3], radius: params.radius };
-    // One lane more counts every voxel, in whole groups.
-    let lanes = MOST_LEVELS + 64;
-    padded::<u8>(tile.codes()) + padded::<u8>(tile.columns(lanes)) + padded::<u32>(tile.sums(lanes))
+    let table = with_dtype!(dtype, T => <T as Coded>::VALUES);
+    padded::<u8>(table)
+        + padded::<u8>(tile.codes())
+        + padded::<u8>(tile.columns(MOST_LEVELS))
+        + padded::<u32>(tile.sums(MOST_LEVELS))
+        + padded::<u8>(tile.moves())
+}
+
+/// What a voxel's openness is computed from, beside its window's counts.
+struct Rule<T> {
+    stored: Stored<T>,
+    slopes: Either,
+    missing: Option<T>,
+    ties: Ties,
+}
+
+/// Slopes in the float that openness is computed in: f32 where it holds twice the largest count and every span, which
+/// depends on no brick.
+#[allow(clippy::large_enum_variant)] // one per brick
+enum Either {
+    F32(Slopes<f32>),
+    F64(Slopes<f64>),
+}
+
+impl<T: Coded> Rule<T> {
+    fn new(levels: &Levels, params: &WindowParams, ties: Ties) -> Rule<T> {
+        let stored = Stored::new(levels, params.flipped());
+        let window = params.radius.iter().map(|r| 2.0 * *r as f64 + 1.0).product::<f64>();
+        let single = Slopes::<f32>::new(levels, &stored);
+        let slopes = if T::DTYPE.result() == DType::F32 && 2.0 * window < f64::from(1 << 24) && single.all_finite() {
+            Either::F32(single)
+        } else {
+            Either::F64(Slopes::new(levels, &stored))
+        };
+        Rule { stored, slopes, missing: missing_as(params.missing), ties }
+    }
+
+    /// Entries of the table of codes.
+    fn values(&self) -> usize {
+        T::VALUES
+    }
 }
 
 #[allow(clippy::too_many_arguments)]
 fn one_tile<T: Coded>(
     level: Level,
     src: View<T>,
-    missing: Option<T>,
-    table: &Table<T>,
+    rule: &Rule<T>,
+    table: &[u8],
     tile: &Tile,
-    ties: Ties,
     bytes: &mut [u8],
     lo: [usize; 3],
     dst: &mut AnyViewMut,
 ) {
     let (codes, bytes) = cut::<u8>(bytes, tile.codes());
-    let mut gaps = false;
+    let mut seen = Seen::default();
     for (i, codes) in codes.chunks_exact_mut(tile.src[2]).enumerate() {
         let row = src.row_at(i / tile.src[1], i % tile.src[1]);
-        gaps |= fill_codes(level, row, missing, table, codes);
+        fill_codes(level, row, rule.missing, &rule.stored, table, codes, &mut seen);
     }
-    let lanes = (table.levels() + usize::from(gaps)).max(1);
-    let job = Job { level, src, missing, table, tile, ties, codes, gaps, lanes };
-    match (lanes <= 32, tile.fits::<u16>()) {
+    // Where no voxel lies above the top level, its lane counts all that exist.
+    let levels = rule.stored.levels().len();
+    let all = seen.gaps && (seen.above || levels == 0);
+    let job = Job { level, src, rule, tile, codes, gaps: seen.gaps, all };
+    match (levels + usize::from(all) <= 32, tile.fits::<u16>()) {
         _ if !tile.planes_fit() => job.planes_beyond_bytes(lo, dst),
         (true, true) => job.run::<u16, 32>(bytes, lo, dst),
         (true, false) => job.run::<u32, 32>(bytes, lo, dst),
@@ -101,39 +149,45 @@ fn one_tile<T: Coded>(
 struct Job<'a, T: Coded> {
     level: Level,
     src: View<'a, T>,
-    missing: Option<T>,
-    table: &'a Table<T>,
+    rule: &'a Rule<T>,
     tile: &'a Tile,
-    ties: Ties,
     codes: &'a [u8],
     /// Voxels are missing.
     gaps: bool,
-    lanes: usize,
-}
-
-/// What is counted for a row of output voxels.
-#[derive(Clone, Copy)]
-pub(crate) struct Counts {
-    /// Voxels of the window.
-    n: [u32; TILE[2]],
-    /// Those not above the level before the centre, and not above the next one.
-    low: [u32; TILE[2]],
-    high: [u32; TILE[2]],
+    /// A lane counts all that are not.
+    all: bool,
 }
 
 impl<T: Coded> Job<'_, T> {
     fn run<S: Sum, const L: usize>(&self, bytes: &mut [u8], lo: [usize; 3], dst: &mut AnyViewMut) {
         let tile = self.tile;
-        let groups = self.lanes.div_ceil(L);
-        let (columns, bytes) = cut::<u8>(bytes, tile.columns(groups * L));
-        let (sums, _) = cut::<S>(bytes, tile.sums(groups * L));
-        let mut counts = Counts { n: [1; TILE[2]], low: [0; TILE[2]], high: [0; TILE[2]] };
-        let all = self.gaps.then_some(self.lanes - 1);
-        sweep::<S, L>(self.level, self.codes, tile, groups, Work { columns, sums }, |z, y, row| {
-            let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
-            count_row(self.level, self.centres(z, y), row, tile, rows, self.table.levels(), all, &mut counts);
-            self.emit(z, y, &counts, lo, dst);
-        });
+        let (columns, bytes) = cut::<u8>(bytes, tile.columns(L));
+        let (sums, bytes) = cut::<S>(bytes, tile.sums(L));
+        let (moves, _) = cut::<u8>(bytes, tile.moves());
+        let (mut counts, windows) = (Counts::new(), Windows::of_columns(tile));
+        for lanes in self.sweeps(L) {
+            sweep::<S, L>(
+                self.level,
+                self.codes,
+                tile,
+                &lanes.thresholds(),
+                Work { columns, sums, moves },
+                |z, y, row| {
+                    let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
+                    count_row(self.level, self.centres(z, y), row, &windows, rows, &lanes, &mut counts);
+                    self.emit(z, y, &counts, lanes.part(), lo, dst);
+                },
+            );
+        }
+    }
+
+    fn sweeps(&self, lanes: usize) -> impl Iterator<Item = Lanes> {
+        let all = match (self.gaps, self.all) {
+            (false, _) => All::Inside,
+            (true, false) => All::Top,
+            (true, true) => All::Last,
+        };
+        Lanes::sweeps(self.rule.stored.levels().len(), all, lanes)
     }
 
     fn centres(&self, z: usize, y: usize) -> &[u8] {
@@ -142,37 +196,66 @@ impl<T: Coded> Job<'_, T> {
         &self.codes[place..][..tile.dst[2]]
     }
 
-    /// Openness of a row from its counts.
-    fn emit(&self, z: usize, y: usize, counts: &Counts, lo: [usize; 3], dst: &mut AnyViewMut) {
+    fn values(&self, z: usize, y: usize) -> &[T] {
         let tile = self.tile;
-        let values = &self.src.row_at(tile.at[0] + z, tile.at[1] + y)[tile.at[2]..][..tile.dst[2]];
-        let codes = self.centres(z, y);
-        let mut open = [0.0; TILE[2]];
-        let open = &mut open[..values.len()];
-        interpolate(self.level, values, codes, self.table, self.ties, counts, open);
-        let mut before = None;
-        for (x, open) in open.iter_mut().enumerate() {
-            let (v, code) = (values[x], usize::from(codes[x]));
-            if gone(v, self.missing) {
-                *open = f64::NAN;
-            } else if let Some(fixed) = infinite(v.to_f64(), self.table.flipped) {
-                *open = fixed;
-            } else if counts.high[x] - counts.low[x] == counts.n[x] && !self.table.steps(code) {
-                // Between two levels there may be one value or many.
-                let known = before.filter(|(at, w)| at + 1 == x && *w == v).is_some();
-                if self.uniform([z, y, x], v, known) {
-                    *open = if self.ties == Ties::Le { 1.0 } else { 0.5 };
-                    before = Some((x, v));
+        &self.src.row_at(tile.at[0] + z, tile.at[1] + y)[tile.at[2]..][..tile.dst[2]]
+    }
+
+    /// Openness of a row from its counts, where its codes are of the part given.
+    fn emit(
+        &self,
+        z: usize,
+        y: usize,
+        counts: &Counts,
+        part: Option<Range<usize>>,
+        lo: [usize; 3],
+        dst: &mut AnyViewMut,
+    ) {
+        let (values, codes, ties) = (self.values(z, y), self.centres(z, y), self.rule.ties);
+        let place = [lo[0] + z, lo[1] + y, lo[2]];
+        match &self.rule.slopes {
+            Either::F32(slopes) => {
+                let mut open = [0.0; RUN];
+                interpolate(self.level, values, codes, slopes, ties, counts, &mut open);
+                self.special([z, y], counts, &mut open[..values.len()]);
+                write(&open, codes, part, place, dst);
+            }
+            Either::F64(slopes) => {
+                let mut open = [0.0; RUN];
+                interpolate(self.level, values, codes, slopes, ties, counts, &mut open);
+                self.special([z, y], counts, &mut open[..values.len()]);
+                write(&open, codes, part, place, dst);
+            }
+        }
+    }
+
+    /// Voxels whose openness is not interpolated: missing ones, infinities, and those in windows of one value.
+    fn special<R: Voxel>(&self, [z, y]: [usize; 2], counts: &Counts, open: &mut [R]) {
+        let (values, codes, rule) = (self.values(z, y), self.centres(z, y), self.rule);
+        if self.gaps || T::DTYPE.is_float() {
+            for (open, v) in open.iter_mut().zip(values) {
+                if gone(*v, rule.missing) {
+                    *open = R::from_f64(f64::NAN);
+                } else if let Some(fixed) = infinite(v.to_f64(), rule.stored.flipped) {
+                    *open = R::from_f64(fixed);
                 }
             }
         }
-        match dst {
-            AnyViewMut::F32(d) => {
-                let row = &mut d.row_at(lo[0] + z, lo[1] + y)[lo[2]..][..open.len()];
-                row.iter_mut().zip(open).for_each(|(d, o)| *d = *o as f32);
+        if !counts.narrow {
+            return;
+        }
+        let mut before = None;
+        for (x, open) in open.iter_mut().enumerate() {
+            let (v, code) = (values[x], usize::from(codes[x]));
+            let settled = gone(v, rule.missing) || infinite(v.to_f64(), rule.stored.flipped).is_some();
+            // Between two levels there may be one value or many.
+            if !settled && counts.high[x] - counts.low[x] == counts.n[x] && !rule.stored.steps(code) {
+                let known = before.filter(|(at, w)| at + 1 == x && *w == v).is_some();
+                if self.uniform([z, y, x], v, known) {
+                    *open = R::from_f64(if rule.ties == Ties::Le { 1.0 } else { 0.5 });
+                    before = Some((x, v));
+                }
             }
-            AnyViewMut::F64(d) => d.row_at(lo[0] + z, lo[1] + y)[lo[2]..][..open.len()].copy_from_slice(open),
-            other => unreachable!("an openness of type {}", other.dtype()),
         }
     }
 
@@ -181,7 +264,7 @@ impl<T: Coded> Job<'_, T> {
     fn uniform(&self, [z, y, x]: [usize; 3], v: T, known: bool) -> bool {
         let (tile, columns) = (self.tile, self.tile.window(2, x));
         let columns = if known { self.tile.window(2, x - 1).end..columns.end } else { columns };
-        let same = |w: &T| *w == v || gone(*w, self.missing);
+        let same = |w: &T| *w == v || gone(*w, self.rule.missing);
         let mut rows = tile.window(0, z).flat_map(|z| tile.window(1, y).map(move |y| (z, y)));
         rows.all(|(z, y)| self.src.row_at(z, y)[columns.clone()].iter().all(same))
     }
@@ -189,7 +272,7 @@ impl<T: Coded> Job<'_, T> {
     /// Windows of more planes than a byte counts: a slab of at most 255 voxels of radius is not worth a kernel of its own.
     fn planes_beyond_bytes(&self, lo: [usize; 3], dst: &mut AnyViewMut) {
         let tile = self.tile;
-        let mut counts = Counts { n: [1; TILE[2]], low: [0; TILE[2]], high: [0; TILE[2]] };
+        let mut counts = Counts { narrow: true, ..Counts::new() };
         for (z, y) in (0..tile.dst[0]).flat_map(|z| (0..tile.dst[1]).map(move |y| (z, y))) {
             let centres = self.centres(z, y);
             for (x, centre) in centres.iter().enumerate() {
@@ -205,75 +288,35 @@ impl<T: Coded> Job<'_, T> {
                 }
                 (counts.n[x], counts.low[x], counts.high[x]) = (n, low, high);
             }
-            self.emit(z, y, &counts, lo, dst);
+            self.emit(z, y, &counts, None, lo, dst);
         }
+    }
+}
+
+/// Writes a row, or those of its voxels whose codes are of `part`.
+fn write<R: Voxel>(open: &[R], codes: &[u8], part: Option<Range<usize>>, [z, y, x]: [usize; 3], dst: &mut AnyViewMut) {
+    macro_rules! put {
+        ($d:expr, $t:ty) => {{
+            let row = $d.row_at(z, y)[x..][..codes.len()].iter_mut().zip(open);
+            match part {
+                None => row.for_each(|(d, o)| *d = o.to_f64() as $t),
+                Some(part) => row
+                    .zip(codes)
+                    .filter(|(_, code)| part.contains(&usize::from(**code)))
+                    .for_each(|((d, o), _)| *d = o.to_f64() as $t),
+            }
+        }};
+    }
+    match dst {
+        AnyViewMut::F32(d) => put!(d, f32),
+        AnyViewMut::F64(d) => put!(d, f64),
+        other => unreachable!("an openness of type {}", other.dtype()),
     }
 }
 
 /// Openness that the specification fixes for an infinite voxel.
 fn infinite(v: f64, flipped: bool) -> Option<f64> {
     v.is_infinite().then(|| f64::from(u8::from((v > 0.0) != flipped)))
-}
-
-multiversion! {
-    /// Counts of a row; `all` is the lane that counts every voxel, where some are missing.
-    fn count_row['a, S: Sum, const L: usize](
-        centres: &[u8], row: Row<'a, S, L>, tile: &Tile, rows: u32, levels: usize, all: Option<usize>, counts: &mut Counts,
-    ) -> () = count_row_inner;
-}
-
-#[inline(always)]
-fn count_row_inner<S: Sum, const L: usize>(
-    centres: &[u8],
-    row: Row<S, L>,
-    tile: &Tile,
-    rows: u32,
-    levels: usize,
-    all: Option<usize>,
-    counts: &mut Counts,
-) {
-    for (x, code) in centres.iter().enumerate().take(TILE[2]) {
-        let (columns, code) = (tile.window(2, x), usize::from(*code));
-        let n = all.map_or(rows * columns.len() as u32, |k| row.count(&columns, k));
-        counts.n[x] = n;
-        counts.low[x] = if code == 0 { 0 } else { row.count(&columns, (code - 1).min(levels.saturating_sub(1))) };
-        counts.high[x] = if code < levels { row.count(&columns, code) } else { n };
-    }
-}
-
-multiversion! {
-    fn interpolate[T: Coded](
-        values: &[T], codes: &[u8], table: &Table<T>, ties: Ties, counts: &Counts, open: &mut [f64],
-    ) -> () = interpolate_inner;
-}
-
-#[inline(always)]
-fn interpolate_inner<T: Coded>(
-    values: &[T],
-    codes: &[u8],
-    table: &Table<T>,
-    ties: Ties,
-    counts: &Counts,
-    open: &mut [f64],
-) {
-    let mut ways = [0.0; TILE[2]];
-    let ways = &mut ways[..values.len()];
-    for ((way, v), code) in ways.iter_mut().zip(values).zip(codes) {
-        *way = table.way(*v, *code);
-    }
-    for (x, (open, way)) in open.iter_mut().zip(ways.iter()).enumerate() {
-        let w = table.weight(*way, codes[x]);
-        let (low, n) = (f64::from(counts.low[x]), f64::from(counts.n[x]));
-        // The product is rounded once and the sum once: at w = 1 both are exact.
-        let at_most = low + (f64::from(counts.high[x]) - low) * w;
-        *open = match ties {
-            Ties::Le => at_most / n,
-            Ties::Mid => {
-                let below = table.weight_below(*way, codes[x]);
-                (at_most + (low + (f64::from(counts.high[x]) - low) * below)) / (2.0 * n)
-            }
-        };
-    }
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Window counts below many thresholds at once, at a cost that does not depend on the radius.
 //!
-//! A voxel is a code: the number of thresholds below it, so that threshold `k` counts it where `code <= k`. Thresholds are
-//! the lanes of vectors, and nothing but additions of vectors happens: each column of the tile has the counts of the window's
+//! A voxel is a code: the number of thresholds below it, so that threshold `k` counts it where `code <= k`. Some thresholds
+//! are the lanes of vectors, and nothing but additions of vectors happens: each column of the tile has the counts of the window's
 //! planes (one voxel enters and one leaves when the window goes down one plane), and `sums[x]` counts the window's rows and
 //! planes over all columns before x, so a window's count is the difference of two elements. All in wrapping integers: exact
 //! as long as the largest count fits.
@@ -77,14 +77,44 @@ impl Tile {
         self.src.iter().product()
     }
 
-    /// Bytes of [`Work::columns`] for so many lanes.
+    /// Bytes of [`Work::columns`] for so many lanes. With 64 lanes a tile should stay within the L2 cache.
     pub fn columns(&self, lanes: usize) -> usize {
         (self.src[1] + 2) * self.src[2] * lanes
     }
 
     /// Elements of [`Work::sums`].
     pub fn sums(&self, lanes: usize) -> usize {
-        (self.src[2] + 1) * lanes
+        2 * (self.src[2] + 1) * lanes
+    }
+
+    /// Bytes of [`Work::moves`].
+    pub fn moves(&self) -> usize {
+        3 * self.src[1] * self.src[2]
+    }
+}
+
+/// Most voxels of a row of a tile whose windows are kept.
+pub(crate) const RUN: usize = 128;
+
+/// Columns of the windows of a tile's rows.
+pub(crate) struct Windows {
+    pub start: [u32; RUN],
+    pub end: [u32; RUN],
+}
+
+impl Windows {
+    pub fn of_columns(tile: &Tile) -> Windows {
+        let mut windows = Windows { start: [0; RUN], end: [0; RUN] };
+        for x in 0..tile.dst[2] {
+            let columns = tile.window(2, x);
+            (windows.start[x], windows.end[x]) = (columns.start as u32, columns.end as u32);
+        }
+        windows
+    }
+
+    #[inline(always)]
+    pub fn of(&self, x: usize) -> Range<usize> {
+        self.start[x] as usize..self.end[x] as usize
     }
 }
 
@@ -93,8 +123,7 @@ pub(crate) trait Sum: crate::grid::Voxel + Into<u32> {
     const MOST: u64;
     fn plus(self, by: Self) -> Self;
     fn minus(self, by: Self) -> Self;
-    /// The difference of two bytes.
-    fn step(into: u8, out: u8) -> Self;
+    fn by(change: i16) -> Self;
 }
 
 macro_rules! sum {
@@ -106,7 +135,7 @@ macro_rules! sum {
             #[inline(always)]
             fn minus(self, by: Self) -> Self { self.wrapping_sub(by) }
             #[inline(always)]
-            fn step(into: u8, out: u8) -> Self { (into as $t).wrapping_sub(out as $t) }
+            fn by(change: i16) -> Self { change as $t }
         }
     )*};
 }
@@ -114,34 +143,45 @@ sum!(u16, u32);
 
 /// Buffers of [`sweep`], cut out of scratch.
 pub(crate) struct Work<'a, S> {
-    /// Counts over planes: `[row][group][column][lane]`, and two rows of zeros.
+    /// Counts over planes: `[row][column][lane]`, and two rows of zeros.
     pub columns: &'a mut [u8],
-    /// `[group][column + 1][lane]`.
+    /// `[column + 1][lane]`, twice.
     pub sums: &'a mut [S],
+    /// Changes of the columns of a plane; see [`Tile::moves`].
+    pub moves: &'a mut [u8],
 }
 
 /// The sums of one output row.
 pub(crate) struct Row<'a, S, const L: usize> {
-    sums: &'a [[S; L]],
-    /// Columns of the tile, and one.
-    pitch: usize,
+    pub sums: &'a [[S; L]],
 }
 
 impl<S: Sum, const L: usize> Row<'_, S, L> {
-    /// Voxels of `columns` that threshold `k` counts.
+    /// Voxels of `columns` that lane `k` counts.
     #[inline(always)]
     pub fn count(&self, columns: &Range<usize>, k: usize) -> u32 {
-        let at = |x: usize| self.sums[k / L * self.pitch + x][k % L];
-        at(columns.end).minus(at(columns.start)).into()
+        self.sums[columns.end][k].minus(self.sums[columns.start][k]).into()
+    }
+
+    /// Neighbouring sums from each place (column times L, plus the lane) on. Panics where there are none. Not compiled for
+    /// vectors, which would gather: plain loads are the faster way.
+    #[inline(never)]
+    pub fn pairs(&self, at: &[u32; RUN]) -> [[S; 2]; RUN] {
+        let flat = self.sums.as_flattened();
+        let last = at.iter().fold(0, |last, at| last.max(*at)) as usize;
+        assert!(last + 1 < flat.len(), "sums {last} and the next of {}", flat.len());
+        // SAFETY: every place is at most the last, which was checked; an array is aligned as its elements are.
+        std::array::from_fn(|x| unsafe { flat.as_ptr().add(at[x] as usize).cast::<[S; 2]>().read() })
     }
 }
 
-/// Calls `emit(z, y, row)` for every output row, with the counts of `groups` times `L` thresholds.
+/// Calls `emit(z, y, row)` for every output row, with the counts of L lanes: lane `k` counts codes up to `lanes[k]`. More
+/// thresholds than lanes: one sweep after the other, whose columns stay in the cache.
 pub(crate) fn sweep<S: Sum, const L: usize>(
     level: Level,
     codes: &[u8],
     tile: &Tile,
-    groups: usize,
+    lanes: &[u8; L],
     work: Work<S>,
     mut emit: impl FnMut(usize, usize, Row<S, L>),
 ) {
@@ -149,117 +189,215 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
     let seen = tile.window(1, 0).start == 0 && tile.window(1, tile.dst[1] - 1).end == tile.src[1];
     assert!(seen, "every row of the source is in a window");
     let [_, rows, width] = tile.src;
-    let (plane, pitch) = (rows * width, width * groups);
-    let columns = work.columns[..tile.columns(groups * L)].as_chunks_mut::<L>().0;
-    let (columns, zeros) = columns.split_at_mut(rows * pitch);
-    let (zeros, none) = zeros.split_at_mut(pitch);
-    let sums = work.sums[..tile.sums(groups * L)].as_chunks_mut::<L>().0;
+    let plane = rows * width;
+    let columns = work.columns[..tile.columns(L)].as_chunks_mut::<L>().0;
+    let (columns, zeros) = columns.split_at_mut(plane);
+    let (zeros, none) = zeros.split_at_mut(width);
+    let (sums, first) = work.sums[..tile.sums(L)].as_chunks_mut::<L>().0.split_at_mut(width + 1);
     columns.fill([0; L]);
     zeros.fill([0; L]);
     none.fill([0; L]);
-    let order = vector::order::<L>(level);
-    let codes_of = |z: usize, y: usize| &codes[z * plane + y * width..][..width];
+    let thresholds = &vector::in_columns(lanes);
+    let tall = tile.most(0) > i8::MAX as usize;
     let mut planes = 0..0;
     for z in 0..tile.dst[0] {
         let now = tile.window(0, z);
         let (leaving, entering) = (planes.start..now.start.min(planes.end), now.start.max(planes.end)..now.end);
+        planes = now;
+        let of = |z: usize| &codes[z * plane..][..plane];
         // One plane in, one out: done with the first look at each row of columns.
         let both = leaving.len() == 1 && entering.len() == 1;
-        if !both {
-            for (y, columns) in columns.chunks_exact_mut(pitch).enumerate() {
-                leaving.clone().for_each(|z| leave(level, &order, codes_of(z, y), columns));
-                if !entering.is_empty() {
-                    let first = &codes[entering.start * plane + y * width..];
-                    enter(level, &order, first, plane, entering.len(), width, columns);
-                }
+        let above = tile.window(1, 0).len() * width;
+        let moves = if both {
+            let moves = Moves::between(level, of(entering.start), of(leaving.start), work.moves);
+            first_rows(level, thresholds, &mut columns[..above], moves.cut(0..above), first);
+            Some(moves)
+        } else if leaving.is_empty() && entering.is_empty() {
+            None
+        } else {
+            leaving.for_each(|z| leave(level, thresholds, of(z), columns));
+            if !entering.is_empty() {
+                enter(level, thresholds, &codes[entering.start * plane..], plane, entering.len(), columns);
             }
-        }
-        planes = now;
-        sums.fill([S::default(); L]);
-        let mut band = 0..0;
+            first.fill([S::default(); L]);
+            for into in columns[..above].chunks_exact_mut(width) {
+                step_rows(level, Rows { thresholds, into, out: zeros, moves: None, tall }, first);
+            }
+            None
+        };
+        sums.copy_from_slice(first);
+        let mut band = tile.window(1, 0);
         for y in 0..tile.dst[1] {
             let now = tile.window(1, y);
             let (leaving, entering) = (band.start..now.start.min(band.end), now.start.max(band.end)..now.end);
             band = now;
             for i in 0..leaving.len().max(entering.len()) {
                 let into = entering.clone().nth(i);
-                let (before, from) = columns.split_at_mut(into.map_or(columns.len(), |y| y * pitch));
-                let out = leaving.clone().nth(i).map_or(&*zeros, |y| &before[y * pitch..][..pitch]);
-                let moved = |y| [codes_of(planes.end - 1, y), codes_of(planes.start - 1, y)];
-                let (into, moved) = match into {
-                    Some(y) => (&mut from[..pitch], both.then(|| moved(y))),
+                let (before, from) = columns.split_at_mut(into.map_or(plane, |y| y * width));
+                let out = leaving.clone().nth(i).map_or(&*zeros, |y| &before[y * width..][..width]);
+                let (into, moves) = match into {
+                    Some(y) => (&mut from[..width], moves.map(|m| m.cut(y * width..(y + 1) * width))),
                     None => (&mut *none, None),
                 };
-                step_rows(level, Rows { groups, into, out, moved }, sums);
+                step_rows(level, Rows { thresholds, into, out, moves, tall }, sums);
             }
-            emit(z, y, Row { sums, pitch: width + 1 });
+            emit(z, y, Row { sums });
         }
     }
 }
 
-/// Whether the lanes of group `g` count a code: all thresholds from the code on.
-#[inline(always)]
-fn counts<const L: usize>(order: &[u8; L], group: usize, code: u8) -> [u8; L] {
-    let first = (group * L) as u8;
-    let mut all = [0; L];
-    for (to, lane) in all.iter_mut().zip(order) {
-        *to = (lane + first >= code) as u8;
+/// How columns change when a voxel of each is replaced: thresholds from `low` on, `length` of them, by `sign`, 1 or -1.
+#[derive(Clone, Copy)]
+pub(super) struct Moves<'a> {
+    pub low: &'a [u8],
+    pub length: &'a [u8],
+    pub sign: &'a [u8],
+}
+
+impl<'a> Moves<'a> {
+    fn between(level: Level, enters: &[u8], leaves: &[u8], bytes: &'a mut [u8]) -> Moves<'a> {
+        let (low, rest) = bytes.split_at_mut(enters.len());
+        let (length, sign) = rest.split_at_mut(enters.len());
+        let sign = &mut sign[..enters.len()];
+        find_moves(level, enters, leaves, low, length, sign);
+        Moves { low, length, sign }
     }
-    all
+
+    fn cut(&self, columns: Range<usize>) -> Moves<'a> {
+        let [low, length, sign] = [self.low, self.length, self.sign].map(|m| &m[columns.clone()]);
+        Moves { low, length, sign }
+    }
+
+    /// Column `x` moved.
+    #[inline(always)]
+    fn apply<const L: usize>(&self, x: usize, thresholds: &[u8; L], mut column: [u8; L]) -> [u8; L] {
+        let (low, length, sign) = (self.low[x], self.length[x], self.sign[x]);
+        for (c, threshold) in column.iter_mut().zip(thresholds) {
+            let moved = threshold.wrapping_sub(low) < length;
+            *c = c.wrapping_add(if moved { sign } else { 0 });
+        }
+        column
+    }
 }
 
 multiversion! {
-    /// Lets a row's voxels of several planes, `stride` codes apart, into its columns.
+    fn find_moves[](enters: &[u8], leaves: &[u8], low: &mut [u8], length: &mut [u8], sign: &mut [u8]) -> () = find_moves_inner;
+}
+
+#[inline(always)]
+fn find_moves_inner(enters: &[u8], leaves: &[u8], low: &mut [u8], length: &mut [u8], sign: &mut [u8]) {
+    for ((((e, l), low), length), sign) in enters.iter().zip(leaves).zip(low).zip(length).zip(sign) {
+        *low = *e.min(l);
+        *length = *e.max(l) - *low;
+        *sign = if e < l { 1 } else { 255 };
+    }
+}
+
+multiversion! {
+    /// Lets voxels of several planes, `stride` codes apart, into their columns.
     fn enter[const L: usize](
-        order: &[u8; L], codes: &[u8], stride: usize, planes: usize, width: usize, columns: &mut [[u8; L]],
+        thresholds: &[u8; L], codes: &[u8], stride: usize, planes: usize, columns: &mut [[u8; L]],
     ) -> () = enter_inner;
 }
 
 #[inline(always)]
 fn enter_inner<const L: usize>(
-    order: &[u8; L],
+    thresholds: &[u8; L],
     codes: &[u8],
     stride: usize,
     planes: usize,
-    width: usize,
     columns: &mut [[u8; L]],
 ) {
-    for (g, columns) in columns.chunks_exact_mut(width).enumerate() {
-        let thresholds = order.map(|lane| lane + (g * L) as u8);
-        for (x, column) in columns.iter_mut().enumerate() {
-            // A copy, so that it stays in registers.
-            let mut counts = *column;
-            for code in codes[x..].iter().step_by(stride).take(planes) {
-                for k in 0..L {
-                    counts[k] = counts[k].wrapping_add((thresholds[k] >= *code) as u8);
-                }
+    let thresholds = *thresholds;
+    for (x, column) in columns.iter_mut().enumerate() {
+        // A copy, so that it stays in registers.
+        let mut counts = *column;
+        for code in codes[x..].iter().step_by(stride).take(planes) {
+            for k in 0..L {
+                counts[k] = counts[k].wrapping_add((thresholds[k] >= *code) as u8);
             }
-            *column = counts;
+        }
+        *column = counts;
+    }
+}
+
+multiversion! {
+    /// Takes voxels of one plane out of their columns.
+    fn leave[const L: usize](thresholds: &[u8; L], codes: &[u8], columns: &mut [[u8; L]]) -> () = leave_inner;
+}
+
+#[inline(always)]
+fn leave_inner<const L: usize>(thresholds: &[u8; L], codes: &[u8], columns: &mut [[u8; L]]) {
+    for (column, code) in columns.iter_mut().zip(codes) {
+        for (c, threshold) in column.iter_mut().zip(thresholds) {
+            *c = c.wrapping_sub(u8::from(threshold >= code));
+        }
+    }
+}
+
+/// Moves the columns of the first window's rows, and its sums with them.
+fn first_rows<S: Sum, const L: usize>(
+    level: Level,
+    thresholds: &[u8; L],
+    columns: &mut [[u8; L]],
+    moves: Moves,
+    sums: &mut [[S; L]],
+) {
+    /// Rows whose changes a signed byte holds.
+    const ROWS: usize = 32;
+    let part = ROWS * (sums.len() - 1);
+    for (i, columns) in columns.chunks_mut(part).enumerate() {
+        let moves = moves.cut(i * part..i * part + columns.len());
+        if !vector::first(level, thresholds, columns, moves, sums) {
+            first(level, thresholds, columns, moves, sums);
         }
     }
 }
 
 multiversion! {
-    /// Takes a row's voxels of one plane out of its columns.
-    fn leave[const L: usize](order: &[u8; L], codes: &[u8], columns: &mut [[u8; L]]) -> () = leave_inner;
+    fn first['a, S: Sum, const L: usize](
+        thresholds: &[u8; L], columns: &mut [[u8; L]], moves: Moves<'a>, sums: &mut [[S; L]],
+    ) -> () = first_inner;
 }
 
 #[inline(always)]
-fn leave_inner<const L: usize>(order: &[u8; L], codes: &[u8], columns: &mut [[u8; L]]) {
-    for (g, columns) in columns.chunks_exact_mut(codes.len()).enumerate() {
-        for (column, code) in columns.iter_mut().zip(codes) {
-            for (c, one) in column.iter_mut().zip(counts(order, g, *code)) {
-                *c = c.wrapping_sub(one);
+fn first_inner<S: Sum, const L: usize>(
+    thresholds: &[u8; L],
+    columns: &mut [[u8; L]],
+    moves: Moves,
+    sums: &mut [[S; L]],
+) {
+    let width = sums.len() - 1;
+    let mut carry = [S::default(); L];
+    for (x, sum) in sums[1..].iter_mut().enumerate() {
+        let mut change = [0u8; L];
+        for at in (x..columns.len()).step_by(width) {
+            let before = columns[at];
+            columns[at] = moves.apply(at, thresholds, before);
+            for k in 0..L {
+                change[k] = change[k].wrapping_add(columns[at][k].wrapping_sub(before[k]));
             }
+        }
+        let change = widen(&change, true);
+        for k in 0..L {
+            carry[k] = carry[k].plus(S::by(change[k]));
+            sum[k] = sum[k].plus(carry[k]);
         }
     }
 }
 
-/// Adds the columns that come in to the sums before each column, and takes off those that leave.
-fn step_rows<S: Sum, const L: usize>(level: Level, mut rows: Rows<L>, sums: &mut [[S; L]]) {
-    if !vector::step(level, &mut rows, sums) {
-        step(level, rows, sums);
+/// Bytes of a column, signed or not, as words in the order of the lanes: even bytes are the first half (see
+/// [`vector::in_columns`]).
+#[inline(always)]
+fn widen<const L: usize>(bytes: &[u8; L], signed: bool) -> [i16; L] {
+    let mut words = [0; L];
+    for (i, pair) in bytes.as_chunks::<2>().0.iter().enumerate() {
+        let word = u16::from_le_bytes(*pair);
+        let (even, odd) = (word << 8, word);
+        words[i] = if signed { even as i16 >> 8 } else { (even >> 8) as i16 };
+        words[L / 2 + i] = if signed { odd as i16 >> 8 } else { (odd >> 8) as i16 };
     }
+    words
 }
 
 multiversion! {
@@ -268,23 +406,22 @@ multiversion! {
 
 #[inline(always)]
 fn step_inner<S: Sum, const L: usize>(rows: Rows<L>, sums: &mut [[S; L]]) {
-    let order = std::array::from_fn(|b| b as u8);
-    let width = rows.into.len() / rows.groups;
-    for g in 0..rows.groups {
-        let part = g * width..(g + 1) * width;
-        let sums = sums[g * (width + 1)..][1..width + 1].iter_mut();
-        let mut carry = [S::default(); L];
-        for (x, ((sum, into), out)) in sums.zip(&mut rows.into[part.clone()]).zip(&rows.out[part]).enumerate() {
-            if let Some([enters, leaves]) = rows.moved {
-                let (more, less) = (counts::<L>(&order, g, enters[x]), counts::<L>(&order, g, leaves[x]));
-                for k in 0..L {
-                    into[k] = into[k].wrapping_add(more[k]).wrapping_sub(less[k]);
-                }
-            }
-            for k in 0..L {
-                carry[k] = carry[k].plus(S::step(into[k], out[k]));
-                sum[k] = sum[k].plus(carry[k]);
-            }
+    let mut carry = [S::default(); L];
+    for (x, ((sum, into), out)) in sums[1..].iter_mut().zip(rows.into).zip(rows.out).enumerate() {
+        if let Some(moves) = rows.moves {
+            *into = moves.apply(x, rows.thresholds, *into);
         }
+        let (into, out) = (widen(into, false), widen(out, false));
+        for k in 0..L {
+            carry[k] = carry[k].plus(S::by(into[k] - out[k]));
+            sum[k] = sum[k].plus(carry[k]);
+        }
+    }
+}
+
+/// Adds the columns that come in to the sums before each column, and takes off those that leave.
+fn step_rows<S: Sum, const L: usize>(level: Level, mut rows: Rows<L>, sums: &mut [[S; L]]) {
+    if !vector::step(level, &mut rows, sums) {
+        step(level, rows, sums);
     }
 }

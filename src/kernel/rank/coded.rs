@@ -7,13 +7,15 @@ use super::buckets::{self, Buckets};
 use super::{Key, Plan, ToKey, gone};
 use crate::brick::scratch::{cut, padded};
 use crate::grid::{DType, Shape, View, ViewMut};
-use crate::kernel::levels::sums::{NEVER, Row, Sum, Tile, Work, sweep};
+use crate::kernel::levels::sums::{NEVER, Row, Sum, Tile, Windows, Work, sweep};
 use crate::kernel::simd::Level;
 use crate::multiversion;
 use crate::stage::Ties;
 
 /// Most thresholds of a tile.
 const MOST: usize = 256;
+/// Most of them that one sweep counts.
+const LANES: usize = 64;
 
 /// Keys as indices that ascend with them.
 pub(super) trait Index: Key {
@@ -25,8 +27,9 @@ pub(super) trait Index: Key {
 
 impl Index for i8 {
     const KEYS: usize = 1 << 8;
-    /// At radius 10 with 256 thresholds, 64 x 64 rows and columns take 22.5 ns per voxel, 64 x 128 take 20.6, 64 x 256 take
-    /// 24.8 (columns of counts leave the L2 cache), 128 x 128 take 26.2 (2-core Zen 4 VM, AVX-512, 2026-11-26).
+    /// At radius 10 with 256 thresholds, 64 x 128 rows and columns take 21.9 ns per voxel, 64 x 96 take 24.5, 64 x 64 take
+    /// 24.8, 96 x 96 in a later build 21.6 beside 19.8: 64 thresholds' columns fill most of the L2 cache, and the rest is
+    /// edges (2-core Zen 4 VM, AVX-512, 2026-11-26).
     const TILE: Shape = [128, 64, 128];
     #[inline(always)]
     fn index(self) -> usize {
@@ -84,7 +87,7 @@ pub(super) fn scratch_bytes<K: Index>(plan: &Plan) -> usize {
     let dst: Shape = std::array::from_fn(|a| K::TILE[a].min(plan.dst[a]));
     let src: Shape = std::array::from_fn(|a| (dst[a] + 2 * plan.radius[a]).min(plan.src[a]));
     let tile = Tile { src, dst, at: [0; 3], radius: plan.radius };
-    let counts = padded::<u8>(tile.columns(MOST)) + padded::<u32>(tile.sums(MOST));
+    let counts = padded::<u8>(tile.columns(LANES)) + padded::<u32>(tile.sums(LANES)) + padded::<u8>(tile.moves());
     let buckets = if K::KEYS > MOST { buckets::scratch_bytes(&tile, K::KEYS) } else { 0 };
     padded::<u8>(K::KEYS) + padded::<u8>(tile.codes()) + counts + buckets
 }
@@ -233,84 +236,188 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// Counts of every window: quotients to `out`, or to the buckets, which correct them first.
+    /// Counts of every window, a group of thresholds after the other: quotients to `out`, or counts to the buckets, which
+    /// correct them first.
     fn run<S: Sum, const L: usize>(&self, bytes: &mut [u8], buckets: &mut Option<Buckets>, out: &mut ViewMut<f32>) {
-        const RUN: usize = 128;
         let tile = self.tile;
-        // With missing voxels one threshold more counts all others.
-        let lanes = (self.thresholds + usize::from(self.gaps)).clamp(1, usize::from(NEVER) + usize::from(!self.gaps));
-        let groups = lanes.div_ceil(L);
-        let (columns, bytes) = cut::<u8>(bytes, tile.columns(groups * L));
-        let (sums, _) = cut::<S>(bytes, tile.sums(groups * L));
-        let all = self.gaps.then_some(lanes - 1);
-        let (mut counted, mut sizes) = ([0; RUN], [0; RUN]);
-        sweep::<S, L>(self.level, self.codes, tile, groups, Work { columns, sums }, |z, y, row| {
-            let place = ((tile.at[0] + z) * tile.src[1] + tile.at[1] + y) * tile.src[2] + tile.at[2];
-            let centres = &self.codes[place..][..tile.dst[2]];
-            let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
-            match buckets {
-                None => {
-                    let (counted, sizes) = (&mut counted[..centres.len()], &mut sizes[..centres.len()]);
-                    count_row(self.level, centres, row, tile, rows, all, self.ties, None, counted, sizes);
-                    divide(self.level, counted, sizes, out.row_at(z, y));
+        let (columns, bytes) = cut::<u8>(bytes, tile.columns(L));
+        let (sums, bytes) = cut::<S>(bytes, tile.sums(L));
+        let (moves, _) = cut::<u8>(bytes, tile.moves());
+        let windows = Windows::of_columns(tile);
+        for group in self.groups::<L>() {
+            let lanes = group.lanes();
+            sweep::<S, L>(self.level, self.codes, tile, &lanes, Work { columns, sums, moves }, |z, y, row| {
+                let place = ((tile.at[0] + z) * tile.src[1] + tile.at[1] + y) * tile.src[2] + tile.at[2];
+                let centres = &self.codes[place..][..tile.dst[2]];
+                let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
+                let counting = Counting { centres, row, windows: &windows, rows, group: &group };
+                match buckets {
+                    None => {
+                        if y + 1 < tile.dst[1] {
+                            fetch(out.row_at(z, y + 1));
+                        }
+                        quotients(self.level, counting, out.row_at(z, y));
+                    }
+                    Some(b) => {
+                        let (counted, sizes, single) = b.row_mut(tile, z, y);
+                        counts(self.level, counting, single, counted, sizes);
+                    }
                 }
-                Some(b) => {
-                    let (counted, sizes, single) = b.row_mut(tile, z, y);
-                    count_row(self.level, centres, row, tile, rows, all, self.ties, Some(single), counted, sizes);
-                }
-            }
-        });
+            });
+        }
+    }
+
+    /// Groups of codes, each with the thresholds that its voxels need.
+    fn groups<const L: usize>(&self) -> impl Iterator<Item = Group> {
+        let mid = self.ties == Ties::Mid;
+        let step = L - usize::from(self.gaps) - usize::from(mid);
+        (0..self.thresholds).step_by(step).map(move |code| Group {
+            code: code as u8,
+            codes: step.min(self.thresholds - code) as u8,
+            first: code.saturating_sub(usize::from(mid)) as u8,
+            gaps: self.gaps,
+            mid,
+        })
+    }
+}
+
+/// Codes whose voxels are counted in one sweep.
+struct Group {
+    code: u8,
+    codes: u8,
+    /// Threshold of the first lane; the others follow.
+    first: u8,
+    /// The last lane counts all voxels but missing ones.
+    gaps: bool,
+    /// Voxels below the centre are counted as well.
+    mid: bool,
+}
+
+impl Group {
+    fn lanes<const L: usize>(&self) -> [u8; L] {
+        std::array::from_fn(|k| match self.gaps && k == L - 1 {
+            true => NEVER - 1,
+            false => self.first.saturating_add(k as u8),
+        })
+    }
+}
+
+/// Asks for a row that is written soon: of all voxels, a group writes a few here and there.
+#[inline(always)]
+fn fetch(row: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    for line in row.chunks(16) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a hint, and every x86-64 has it.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
+    }
+    let _ = row;
+}
+
+/// A row of centres, and what its windows are counted by.
+struct Counting<'a, S, const L: usize> {
+    centres: &'a [u8],
+    row: Row<'a, S, L>,
+    windows: &'a Windows,
+    /// Rows of each window.
+    rows: u32,
+    group: &'a Group,
+}
+
+impl<S: Sum, const L: usize> Counting<'_, S, L> {
+    /// Which of up to 64 centres from `first` on are of the group: bit i for centre i.
+    #[inline(always)]
+    fn members(&self, first: usize) -> u64 {
+        let centres = &self.centres[first..];
+        let (code, codes) = (self.group.code, self.group.codes);
+        let mut padded = [code.wrapping_sub(1); 64];
+        let n = centres.len().min(64);
+        padded[..n].copy_from_slice(&centres[..n]);
+        let mut mask = 0;
+        for (i, c) in padded.iter().enumerate() {
+            mask |= u64::from(c.wrapping_sub(code) < codes) << i;
+        }
+        mask
+    }
+
+    /// Voxels not above centre `x`, with `ties = "mid"` plus those below it, and the size of the window (twice); `alone`: the
+    /// code stands for one value. Where it does not, all of its voxels count as not above.
+    #[inline(always)]
+    fn count(&self, x: usize, alone: bool) -> (u32, u32) {
+        let (columns, code, group) = (self.windows.of(x), self.centres[x], self.group);
+        let lane = usize::from(code.wrapping_sub(group.first)) % L;
+        let counted = self.row.count(&columns, lane);
+        let size = if group.gaps { self.row.count(&columns, L - 1) } else { self.rows * columns.len() as u32 };
+        if !group.mid {
+            return (counted, size);
+        }
+        let below = match code {
+            _ if !alone => counted,
+            0 => 0,
+            _ => self.row.count(&columns, (lane + L - 1) % L),
+        };
+        (counted + below, 2 * size)
     }
 }
 
 multiversion! {
-    /// Voxels not above each centre, with `ties = "mid"` plus those below it, and the sizes of the windows (twice). `all` is
-    /// the threshold that counts every voxel, where some are missing; `single` says whether a code stands for one value:
-    /// where it does not, all of its voxels count as not above.
-    fn count_row['a, S: Sum, const L: usize](
-        centres: &[u8], row: Row<'a, S, L>, tile: &Tile, rows: u32, all: Option<usize>, ties: Ties,
-        single: Option<&[bool; MOST]>, counted: &mut [u32], sizes: &mut [u32],
-    ) -> () = count_row_inner;
+    /// Openness of the centres of a group.
+    fn quotients['a, S: Sum, const L: usize](counting: Counting<'a, S, L>, out: &mut [f32]) -> () = quotients_inner;
 }
 
 #[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn count_row_inner<S: Sum, const L: usize>(
-    centres: &[u8],
-    row: Row<S, L>,
-    tile: &Tile,
-    rows: u32,
-    all: Option<usize>,
-    ties: Ties,
-    single: Option<&[bool; MOST]>,
-    counted: &mut [u32],
-    sizes: &mut [u32],
-) {
-    for (x, ((code, counted), size)) in centres.iter().zip(counted).zip(sizes).enumerate() {
-        let columns = tile.window(2, x);
-        *size = all.map_or(rows * columns.len() as u32, |k| row.count(&columns, k));
-        // What a missing centre gets is written over.
-        let code = if all.is_some() && *code == NEVER { 0 } else { usize::from(*code) };
-        *counted = row.count(&columns, code);
-        if ties == Ties::Mid {
-            let alone = single.is_none_or(|s| s[code]);
-            *counted += match code {
-                _ if !alone => *counted,
-                0 => 0,
-                _ => row.count(&columns, code - 1),
-            };
-            *size *= 2;
+fn quotients_inner<S: Sum, const L: usize>(counting: Counting<S, L>, out: &mut [f32]) {
+    for first in (0..counting.centres.len()).step_by(64) {
+        let mut mask = counting.members(first);
+        while mask != 0 {
+            let x = first + mask.trailing_zeros() as usize;
+            mask &= mask - 1;
+            let (counted, size) = counting.count(x, true);
+            // Integers below 2^24 are f32, and their quotient is rounded once.
+            let narrow = 2 * S::MOST < 1 << 24;
+            out[x] = if narrow { counted as f32 / size as f32 } else { quotient(counted, size) };
         }
     }
 }
 
 multiversion! {
-    /// Quotients of integers below 2^53, rounded to f64 and then to f32 as if at once (see `Counts::openness`).
+    /// Counts of the centres of a group; `single` says whether a code stands for one value.
+    fn counts['a, S: Sum, const L: usize](
+        counting: Counting<'a, S, L>, single: &[bool; MOST], counted: &mut [u32], sizes: &mut [u32],
+    ) -> () = counts_inner;
+}
+
+#[inline(always)]
+fn counts_inner<S: Sum, const L: usize>(
+    counting: Counting<S, L>,
+    single: &[bool; MOST],
+    counted: &mut [u32],
+    sizes: &mut [u32],
+) {
+    for first in (0..counting.centres.len()).step_by(64) {
+        let mut mask = counting.members(first);
+        while mask != 0 {
+            let x = first + mask.trailing_zeros() as usize;
+            mask &= mask - 1;
+            (counted[x], sizes[x]) = counting.count(x, single[usize::from(counting.centres[x])]);
+        }
+    }
+}
+
+/// The quotient of two integers below 2^53, rounded to f64 and then to f32 as if at once (see `Counts::openness`).
+#[inline(always)]
+fn quotient(counted: u32, size: u32) -> f32 {
+    (f64::from(counted) / f64::from(size)) as f32
+}
+
+multiversion! {
+    /// Quotients of a row.
     fn divide[](counted: &[u32], sizes: &[u32], out: &mut [f32]) -> () = divide_inner;
 }
 
 #[inline(always)]
 fn divide_inner(counted: &[u32], sizes: &[u32], out: &mut [f32]) {
-    let quotients = counted.iter().zip(sizes).map(|(c, n)| (f64::from(*c) / f64::from(*n)) as f32);
-    out.iter_mut().zip(quotients).for_each(|(o, q)| *o = q);
+    for ((o, c), n) in out.iter_mut().zip(counted).zip(sizes) {
+        *o = quotient(*c, *n);
+    }
 }
