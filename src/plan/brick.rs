@@ -246,6 +246,8 @@ pub fn mib(bytes: u64) -> String {
         format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64)
     } else if bytes >= 1 << 20 || bytes == 0 {
         format!("{:.1} MiB", bytes as f64 / (1 << 20) as f64)
+    } else if bytes < 1 << 10 {
+        format!("{bytes} bytes")
     } else {
         format!("{:.1} KiB", bytes as f64 / 1024.0)
     }
