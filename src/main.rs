@@ -4,5 +4,19 @@ fn main() -> std::process::ExitCode {
         // SAFETY: the only thread so far.
         unsafe { std::env::set_var("XDG_RUNTIME_DIR", std::env::temp_dir()) };
     }
+    give_large_buffers_back();
     occlude::cli::main()
+}
+
+/// Buffers of bricks that are freed go back to the system at once. Left to itself, glibc soon cuts blocks of up to 32 MiB
+/// from its heap, and what is freed between others stays resident: memory that the budget counts as free. 2-core Zen 4 VM,
+/// 2026-11-26, the chain of stages of `tests/memory_budget.rs` under 160 MiB: a peak of 171 to 177 MiB without this, 138 to
+/// 145 with it, 134 with 1 MiB; chains of bricks of 294 MiB under 1400 MiB: 1587 MiB without, 1321 with. The shipped
+/// example takes the same time with 4 MiB, and a tenth more system time with 1 MiB.
+fn give_large_buffers_back() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: sets one number of the allocator; the only thread so far.
+    unsafe {
+        libc::mallopt(libc::M_MMAP_THRESHOLD, 4 << 20);
+    }
 }

@@ -223,7 +223,15 @@ fn a_run_from_config_to_comparison() {
     assert!(code == 2 && err.contains("--overwrite"), "{err}");
     let (code, out, err) = call(f, &["run", "job.toml", "-q", "--overwrite"]);
     assert!(code == 0 && out.is_empty() && err.is_empty(), "{err}");
-    assert_eq!(call(f, &["run", "job.toml", "-q", "--resume"]).0, 0);
+    let (code, _, err) = call(f, &["run", "job.toml", "--resume"]);
+    assert!(code == 0 && err.contains("nothing was left to do") && !err.contains("voxels/s"), "{err}");
+    // What is wrong with a flag is said of the flag.
+    for args in
+        [&["preview", "out/z.zarr", "o.png", "--level", "9"][..], &["info", "out/z.zarr", "--stats", "--level", "9"]]
+    {
+        let (code, _, err) = call(f, args);
+        assert!(code == 2 && err.contains("error: --level: 9: the image has"), "{err}");
+    }
 }
 
 #[test]

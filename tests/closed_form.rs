@@ -148,3 +148,17 @@ fn faces_of_the_phantom_bleed_by_their_closed_form_on_the_axes() {
         }
     }
 }
+
+#[test]
+fn what_masked_voxels_hold_is_no_saliency() {
+    // Slopes of 0.001, 0.002 and 0.003 along x, far below the fill of the half that nothing needs.
+    let slope = |x: usize| [0.001, 0.002, 0.003][x / 10];
+    let value = |x: usize| (0..x).map(slope).sum::<f64>();
+    let v = Array3::from_shape_fn((20, 12, 30), |(_, _, x)| value(x) as f32);
+    let body = "op = 'saliency'\nsize = 3\nscale = 'max'\nfill = 0.5\nwhere = { input = 'a', max = 0.029 }";
+    let o = stage(&v, body);
+    // Needed are the first 20 voxels of a row: the largest of their saliencies is 0.0025, where two slopes meet, or 0.002.
+    let largest = (0..20).map(|x| o[[10, 6, x]]).fold(0.0, f64::max);
+    assert!((largest - 1.0).abs() < 1e-6, "{largest}");
+    assert_eq!(o[[10, 6, 29]], 0.5);
+}

@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use common::*;
-use occlude::run::{Cancel, Progress, RunOptions};
+use occlude::run::{Cancel, Progress, RunOptions, Session, Silent};
 
 const SHAPE: [usize; 3] = [24, 40, 2300];
 
@@ -312,5 +312,34 @@ fn a_vanished_chunk_is_not_taken_for_one_that_was_never_stored() {
             let _ = fs::remove_dir_all(&array);
             let _ = fs::remove_dir_all(dir.path().join("elsewhere.zarr"));
         }
+    }
+}
+
+/// A second run into outputs that a first is writing would delete or mix what that wrote.
+#[test]
+fn one_run_at_a_time_writes_an_output() {
+    let dir = folder();
+    let config = parse(dir.path(), CONFIG, &[]);
+    let plain = RunOptions::default();
+    let first = Session::open(&config, &plain, &Silent).map_err(|e| e.to_string());
+    let first = first.unwrap_or_else(|e| panic!("{e}"));
+    let tasks = first.open_tasks();
+    first.run_task(tasks[0]).unwrap();
+    let other = parse(dir.path(), CONFIG, &["stage.ao.radius=5"]);
+    for (resume, overwrite) in [(false, false), (true, false), (false, true)] {
+        let options = RunOptions { resume, overwrite, ..Default::default() };
+        let error = Session::open(&other, &options, &Silent).map(|_| ()).unwrap_err();
+        assert_eq!(error.exit_code(), 2);
+        assert!(error.to_string().contains("ao.zarr is being written by another run"), "{error}");
+    }
+    first.run_tasks(&tasks[1..]).unwrap();
+    first.finish().unwrap();
+    let alone = decoded(dir.path());
+    // Ended, however it ended, it keeps nobody out.
+    let again = RunOptions { overwrite: true, ..Default::default() };
+    drop(Session::open(&config, &again, &Silent).map_err(|e| e.to_string()).unwrap_or_else(|e| panic!("{e}")));
+    run(dir.path(), CONFIG, &[]);
+    for (name, (a, b)) in OUTPUTS.iter().zip(alone.iter().zip(&decoded(dir.path()))) {
+        assert_same(name, a, b);
     }
 }

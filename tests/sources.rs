@@ -44,6 +44,7 @@ fn nifti_time_points_are_selected_and_the_qform_gives_the_matrix() {
     input.time = Select::All;
     let source = check(&input, 1, 1);
     assert_eq!(source.info().component_names, ["time 0", "time 1"]);
+    assert_eq!(source.info().times, 2, "told even where one is read");
     input.time = Select::Index(2);
     let e = Source::open(&input).unwrap_err();
     assert_eq!(e.exit_code(), 2);

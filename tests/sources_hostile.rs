@@ -298,6 +298,8 @@ fn lies_are_named() {
         b.extend(dict.as_bytes());
         b
     };
+    let mut pair = vec![0; 348];
+    pair[..4].copy_from_slice(&348u32.to_le_bytes());
     let lies: Vec<(&str, Vec<u8>, &str)> = vec![
         ("a.nrrd", nrrd("sizes: 4 4 4"), "cut off or its header is wrong"),
         ("b.nrrd", nrrd("sizes: 4294967296 4294967296 4294967296"), "larger than any file"),
@@ -309,6 +311,14 @@ fn lies_are_named() {
             b"NRRD0004\ntype: uchar\ndimension: 3\nencoding: bzip2\nsizes: 1 1 1\n\n0".to_vec(),
             "raw and gzip are",
         ),
+        // Text has no byte order.
+        (
+            "f2.nrrd",
+            b"NRRD0004\ntype: short\ndimension: 3\nencoding: ascii\nsizes: 1 1 1\n\n7".to_vec(),
+            "raw and gzip are",
+        ),
+        ("pair.hdr", pair.clone(), "pairs of .hdr and .img"),
+        ("pair.img", vec![0; 64], "pairs of .hdr and .img"),
         ("g.nrrd", b"NRRD0004\ntype: block\ndimension: 3\nencoding: raw\nsizes: 1 1 1\n\n0".to_vec(), "block"),
         ("h.nrrd", b"NRRD0004\ntype: short\ndimension: 3\nencoding: raw\nsizes: 1 1 1\n\n00".to_vec(), "endian"),
         ("i.nrrd", nrrd("sizes: 3 1 1\nkinds: RGB-color space space"), "rgb-color"),
@@ -361,6 +371,7 @@ fn lying_zarr_metadata_are_named() {
         (array("[4,4,4]", "[4,4,4]", "bool"), "bool"),
         (array("[4,4,4]", "[4,4,4]", "float16"), "f16"),
         (array("[2,2,2,2,4,4,4]", "[1,1,1,1,4,4,4]", "uint8"), "more axes"),
+        (array("[4,4,4]", "[4,4,4]", "uint8").replace("\"bytes\"", "\"bz2\""), "codecs that are read: blosc"),
         ("{}".to_string(), "neither"),
         ("{".to_string(), "broken JSON"),
         (r#"{"zarr_format":3,"node_type":"group","attributes":{}}"#.to_string(), "without multiscales"),

@@ -144,6 +144,7 @@ fn as_json(
         "dtype": info.dtype.name(),
         "components": info.components,
         "component_names": info.component_names,
+        "times": info.times,
         "voxels": info.voxels(),
         "spacing": info.spacing,
         "unit": info.unit,
@@ -197,6 +198,9 @@ fn as_text(
     let _ = writeln!(t, "  dtype     {}, {} unpacked", info.dtype, human::bytes(bytes));
     if info.components > 1 {
         let _ = writeln!(t, "  channels  {} {}", info.components, info.component_names.join(", "));
+    }
+    if info.times > 1 {
+        let _ = writeln!(t, "  times     {}; inputs read the first unless `time` says another", info.times);
     }
     let _ = writeln!(t, "  spacing   {} (z, y, x), {unit}", triple(info.spacing));
     let _ = writeln!(t, "  origin    {} (z, y, x)", triple(info.origin));

@@ -46,6 +46,9 @@ pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
 
 /// One line for people.
 pub fn summary(r: &Report) -> String {
+    if r.bricks.resumed > 0 && r.bricks.resumed == r.bricks.total {
+        return format!("nothing was left to do: all {} bricks were finished before", r.bricks.total);
+    }
     let skipped: u64 = r.bricks.skipped.values().sum();
     let mut parts = vec![format!("{} of {} bricks computed", r.bricks.computed, r.bricks.total)];
     if r.bricks.resumed > 0 {

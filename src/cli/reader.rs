@@ -78,6 +78,17 @@ fn input(path: &Path, level: usize, raw: &RawArgs) -> Result<Input> {
     })
 }
 
+/// A key of the input that stands for the command line is a flag there.
+fn of_flag(path: &Path, error: Error) -> Error {
+    match error {
+        Error::Config { key, message, .. } => match key.strip_prefix(&format!("input.{}.", path.display())) {
+            Some(name) => usage(&format!("--{name}"), &message),
+            None => Error::config(key, message),
+        },
+        other => other,
+    }
+}
+
 impl Volume {
     /// Opens a volume and makes its voxels readable (gzip is unpacked into a temporary folder).
     pub fn open(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
@@ -107,7 +118,7 @@ impl Volume {
 
     fn open_level(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
         let attributes = attributes::read(path);
-        let mut source = Source::open(&described(path, level, raw, &attributes)?)?;
+        let mut source = Source::open(&described(path, level, raw, &attributes)?).map_err(|e| of_flag(path, e))?;
         let scratch = if source.spool_bytes() > 0 { Some(Scratch::new()?) } else { None };
         let folder = scratch.as_ref().map_or_else(std::env::temp_dir, |s| s.0.clone());
         source.prepare(&folder, &|_| !cancel.is_cancelled())?;

@@ -10,7 +10,7 @@ use crate::config::{Config, Output, provenance, stage_constants, stage_parameter
 use crate::grid::Region;
 use crate::kernel::reduce::planes;
 use crate::plan::{Group, OutputPlan, Plan};
-use crate::store::sink::{Existing, Sink, existing, remove_ours};
+use crate::store::sink::{Claim, Existing, Sink, existing, remove_ours};
 use crate::store::{Spill, VolumeInfo};
 use crate::{Error, Result};
 
@@ -40,6 +40,26 @@ pub fn is_complete(plan: &Plan, o: usize, header: &Value) -> bool {
     let inputs = attributes["input"].as_array().into_iter().flatten().map(|i| &i["identity"]);
     attributes["config_hash"] == header["config_hash"]
         && header["inputs"].as_array().is_some_and(|wanted| inputs.eq(wanted))
+}
+
+/// Claims the outputs that an earlier run began, before anything of them is read or deleted: one run at a time writes them.
+pub fn claim_begun(config: &Config, plan: &Plan) -> Result<Vec<Option<Claim>>> {
+    let claim = |o: &OutputPlan| Claim::existing(&o.spec.path).map_err(|_| busy(config, o));
+    plan.outputs.iter().map(claim).collect()
+}
+
+/// Claims those that were not begun, or begun and now deleted.
+pub fn claim_all(config: &Config, plan: &Plan, claims: &mut [Option<Claim>]) -> Result<()> {
+    for (output, claim) in plan.outputs.iter().zip(claims) {
+        if !claim.as_ref().is_some_and(Claim::holds) {
+            *claim = Some(Claim::make(&output.spec.path)?.map_err(|_| busy(config, output))?);
+        }
+    }
+    Ok(())
+}
+
+fn busy(config: &Config, output: &OutputPlan) -> Error {
+    refused(config, output, "is being written by another run; wait until that has ended, or stop it")
 }
 
 /// Decides by what lies at the outputs' paths. Deletes only what this program wrote.

@@ -26,7 +26,7 @@ use crate::config::{Config, Device, config_hash};
 use crate::gpu::{self, Gpu};
 use crate::grid::{Region, order::morton};
 use crate::plan::{BrickChoice, Group, Plan};
-use crate::store::sink::Sink;
+use crate::store::sink::{Claim, Sink};
 use crate::store::{Source, VolumeInfo, open_inputs};
 use crate::{Error, Result};
 
@@ -50,6 +50,8 @@ pub struct Session<'a> {
     /// By output; `None` for those that were complete when the run was opened.
     targets: Vec<Option<Target>>,
     journal: Option<Journal>,
+    /// Kept until the session ends: no other run may write the outputs.
+    _claims: Vec<Option<Claim>>,
     done: Vec<bool>,
     globals: Vec<Vec<f64>>,
     threads: rayon::ThreadPool,
@@ -86,7 +88,11 @@ impl<'a> Session<'a> {
         let hash = config_hash(config);
         let placement = placement_json(&plan);
         let header = journal::header(&hash, &identities, plan.task_count(), &placement, &[]);
+        let mut claims = outputs::claim_begun(config, &plan)?;
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
+        if start != Start::Complete {
+            outputs::claim_all(config, &plan, &mut claims)?;
+        }
         let threads = rayon::ThreadPoolBuilder::new()
             .num_threads(plan.workers)
             .thread_name(|i| format!("compute-{i}"))
@@ -106,6 +112,7 @@ impl<'a> Session<'a> {
             hash,
             sources,
             journal: None,
+            _claims: claims,
             done: vec![false; tasks],
             globals: Vec::new(),
             threads,
@@ -345,6 +352,9 @@ impl<'a> Session<'a> {
         tick: &(dyn Fn() + Sync),
     ) -> Result<()> {
         let cache = ChunkCache::new(brick.cache);
+        // Where nothing is cached, what the cache might hold is room for buffers that wait.
+        let cached = if self.infos.iter().any(|i| i.chunk.is_some()) { 0 } else { brick.cache };
+        self.pool.bound((brick.bytes * brick.in_flight as u64 + cached) as usize);
         let reader =
             Reader { engine, program, sources: &self.sources, cache: &cache, uses: self.uses(program, work), metrics };
         let stream = Stream {

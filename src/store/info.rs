@@ -22,6 +22,8 @@ pub struct VolumeInfo {
     /// Components (channels read with `"all"`); 1 for a scalar volume.
     pub components: usize,
     pub component_names: Vec<String>,
+    /// Points in time that the file holds; one is read where `time` is not `"all"`.
+    pub times: usize,
     /// Storage chunks, `[z, y, x]`; `None` for formats that are read by plain rows.
     pub chunk: Option<Shape>,
     /// How the file stores it, for people: `NIfTI-1, gzip`, `Zarr v3, blosc`, ...
@@ -51,6 +53,7 @@ impl VolumeInfo {
             nodata: None,
             components: 1,
             component_names: Vec::new(),
+            times: 1,
             chunk: None,
             format: format.into(),
         }

@@ -98,6 +98,8 @@ impl Lowering<'_> {
         let step = self.new_step(node, kind, vec![src], [size / 2; 3], Border::Nearest)?;
         let raw = self.output_wire(index, node, "saliency", step, &[src]);
         self.out.graph.wires[raw].name = format!("{}.saliency (raw)", node.name);
+        // What masked voxels are filled with is no saliency: it must not be the largest.
+        self.out.graph.wires[raw].fill = 0.0;
         self.out.graph.steps[step].outputs.push(raw);
         self.out.prepasses.push(Prepass { wires: vec![raw], kind: PrepassKind::Max });
         let by = self.out.prepasses.len() - 1;

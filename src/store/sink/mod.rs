@@ -1,5 +1,6 @@
 //! Volumes that are written: chunk by chunk, committed by rename, finished with their attributes.
 
+pub mod claim;
 mod encode;
 pub mod existing;
 mod files;
@@ -16,6 +17,7 @@ use super::info::Orientation;
 use crate::config::{Codec, OutputFormat};
 use crate::grid::{AnyView, DType, Region, Shape};
 use crate::{Error, Result};
+pub use claim::Claim;
 pub use existing::{Existing, existing, remove_ours};
 
 /// What an output is; made by the planner.

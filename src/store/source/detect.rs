@@ -46,11 +46,26 @@ pub fn detect(path: &Path) -> Result<Format> {
     if let Some((_, format)) = by_name.into_iter().find(|(end, _)| name.ends_with(end)) {
         return Ok(format);
     }
-    by_magic(&bytes::file_head(path, 512)?).ok_or_else(|| {
+    let head = bytes::file_head(path, 512)?;
+    by_magic(&head).ok_or_else(|| {
+        if is_pair(path, &head) {
+            return Error::file(
+                path,
+                "NIfTI and Analyze pairs of .hdr and .img are not read; save one .nii or .nii.gz",
+            );
+        }
         let raw = name.ends_with(".raw") || name.ends_with(".raw.gz") || name.ends_with(".bin");
         let hint = if raw { "headerless voxels need format = \"raw\", shape and dtype" } else { "unknown format" };
         Error::file(path, format!("{hint}; read are {KNOWN}"))
     })
+}
+
+/// Whether this is a half of a pair: a header of 348 bytes, or voxels with such a header beside them.
+fn is_pair(path: &Path, head: &[u8]) -> bool {
+    let is_header = |head: &[u8]| [348u32.to_le_bytes(), 348u32.to_be_bytes()].iter().any(|n| head.starts_with(n));
+    let header = path.with_extension("hdr");
+    let beside = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("img")) && header.is_file();
+    is_header(head) || beside && bytes::file_head(&header, 4).is_ok_and(|h| is_header(&h))
 }
 
 fn by_magic(head: &[u8]) -> Option<Format> {

@@ -169,6 +169,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let packed = h.flag(&["CompressedData"]);
     let mut info = VolumeInfo::plain(shape, dtype, if packed { "MetaImage, zlib" } else { "MetaImage" });
     (info.components, info.component_names) = (layout.bases.len(), layout.names.clone());
+    info.times = layout.times as usize;
     geometry(path, &h, dims, &mut info)?;
 
     let (files, local, spanned) = data_files(path, &h)?;

@@ -231,6 +231,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let mut info = VolumeInfo::plain(shape, dtype, format);
     info.components = pairs.len();
     info.component_names = names;
+    info.times = dim(4) as usize;
     info.spacing =
         std::array::from_fn(
             |a| if h.pixdim[3 - a] == 0.0 || 3 - a as i64 > axes { 1.0 } else { h.pixdim[3 - a].abs() },

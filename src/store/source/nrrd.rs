@@ -315,6 +315,12 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
         })?;
     let sizes: Vec<u64> = numbers(path, &h, "sizes", dimension)?.ok_or_else(|| missing("sizes"))?;
     let dtype = dtype(path, h.get("type").ok_or_else(|| missing("type"))?)?;
+    // Before the byte order, which text has none of.
+    let gzip = match h.get("encoding").ok_or_else(|| missing("encoding"))?.to_lowercase().as_str() {
+        "raw" => false,
+        "gzip" | "gz" => true,
+        other => return Err(Error::file(path, format!("NRRD encoding {other} is not read; raw and gzip are"))),
+    };
     let big_endian = match h.get("endian").map(str::to_lowercase).as_deref() {
         Some("big") => true,
         Some("little") => false,
@@ -324,11 +330,6 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
             return Err(Error::file(path, format!("broken NRRD header: endian `{other}`; little or big are expected")));
         }
     };
-    let gzip = match h.get("encoding").ok_or_else(|| missing("encoding"))?.to_lowercase().as_str() {
-        "raw" => false,
-        "gzip" | "gz" => true,
-        other => return Err(Error::file(path, format!("NRRD encoding {other} is not read; raw and gzip are"))),
-    };
     let directions =
         h.get("space directions").map(|t| vectors(path, "space directions", t)).transpose()?.unwrap_or_default();
     let axes = axes(path, &h, &sizes, &directions)?;
@@ -336,6 +337,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let shape = shape_of(path, layout.zyx, dtype.size())?;
     let mut info = VolumeInfo::plain(shape, dtype, if gzip { "NRRD, gzip" } else { "NRRD, raw" });
     (info.components, info.component_names) = (layout.bases.len(), layout.names.clone());
+    info.times = layout.times as usize;
     geometry(path, &h, &axes, &directions, &mut info)?;
 
     let skip_lines = skip(path, &h, "line skip")?;

@@ -39,6 +39,8 @@ pub struct Layout {
     /// First byte of each selected component.
     pub bases: Vec<u64>,
     pub names: Vec<String>,
+    /// Points in time, selected or not.
+    pub times: u64,
     /// Bytes of all voxels of all components.
     pub bytes: u64,
 }
@@ -76,7 +78,7 @@ pub fn layout(input: &Input, path: &Path, axes: &[Axis], dtype: DType) -> Result
     (space..3).for_each(|i| strides[2 - i] = stride);
     let (pairs, names) = components(input, extra[0].0 as usize, extra[1].0 as usize, &[])?;
     let bases = pairs.iter().map(|(t, c)| *t as u64 * extra[0].1 + *c as u64 * extra[1].1).collect();
-    Ok(Layout { zyx, strides, bases, names, bytes: stride })
+    Ok(Layout { zyx, strides, bases, names, times: extra[0].0, bytes: stride })
 }
 
 impl Layout {

@@ -100,6 +100,15 @@ struct Form {
     compression: u16,
 }
 
+impl std::fmt::Display for Form {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let order = if self.big_endian { "big" } else { "little" };
+        let zero = if self.white_is_zero { ", white is zero" } else { "" };
+        let Form { width, height, dtype, compression, .. } = self;
+        write!(f, "{width} x {height} {dtype}, {order} endian, compression {compression}{zero}")
+    }
+}
+
 fn dtype(path: &Path, bits: u64, format: u64) -> Result<DType> {
     Ok(match (format, bits) {
         (1 | 4, 8) => DType::U8,
@@ -281,7 +290,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
         ));
     }
     if let Some(odd) = all.iter().find(|p| p.form != first.form) {
-        let text = format!("{} ({:?}) differs from the first page ({:?})", name(odd), odd.form, first.form);
+        let text = format!("{} ({}) differs from the first page ({})", name(odd), odd.form, first.form);
         return Err(Error::file(path, text));
     }
     let form = first.form;
@@ -324,6 +333,7 @@ fn place(
     let kind = if form.compression == 1 { "uncompressed".to_string() } else { compression_name(form.compression) };
     let mut info = VolumeInfo::plain(shape, form.dtype, format!("TIFF{folder}, {kind}"));
     (info.components, info.component_names) = (pairs.len(), names);
+    info.times = order.t;
     info.spacing = described.spacing;
     info.unit = described.unit;
     let header = format!("{form:?} {order:?} {pairs:?}").into_bytes();

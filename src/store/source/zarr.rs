@@ -174,6 +174,9 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
     Ok(())
 }
 
+/// What a message about a codec ends with.
+const CODECS: &str = "; codecs that are read: blosc, gzip, zlib, zstd, crc32c, transpose and shards of them";
+
 /// Opens a Zarr array or an OME-Zarr image.
 pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     let (folder, mut meta, multiscale) = find(input, path)?;
@@ -217,11 +220,15 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     let mut info = VolumeInfo::plain(shape, meta.dtype, format!("{ome}Zarr v{}, {sharded}{codec_text}", meta.version));
     info.chunk = Some(chunk);
     (info.components, info.component_names) = (components.len(), names);
+    info.times = count(Lead::Time) as usize;
     if let Some(m) = &multiscale {
         geometry(&folder, m, lead, n, &mut info)?;
     }
 
-    let failed = |e: String| Error::file(&folder, format!("the Zarr array cannot be read: {e}"));
+    let failed = |e: String| {
+        let read = if e.contains("codec") { CODECS } else { "" };
+        Error::file(&folder, format!("the Zarr array cannot be read: {e}{read}"))
+    };
     // Files are opened here, under paths of any bytes; the library, which wants UTF-8, only decodes.
     let store = FilesystemStore::new("/").map_err(|e| failed(e.to_string()))?;
     let array = guarded(|| {
