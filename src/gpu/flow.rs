@@ -5,13 +5,14 @@
 
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
-use super::passes::{cut, stored};
+use super::passes::{cut_to, stored};
 use super::points::{LOOKED, Op};
 use super::record::{Bind, Buffer, Recording, Sizes};
 use super::recorder::Recorder;
 use super::slopes::Fit;
-use super::sweep::MOST_REPEATED;
+use super::sweep::repeated;
 use super::taps::Wanted;
+use super::unfit::Unfit;
 use crate::grid::{Affine, DType, Region};
 use crate::kernel::obscurance::ObscuranceParams;
 use crate::stage::{WindowChannel, WindowParams};
@@ -133,9 +134,12 @@ impl Flow {
         Some((hull, unit, pyramids().next().map_or(hull.lo, |(s, _)| s.region.lo)))
     }
 
-    /// Parts of which every buffer is at most `cap` bytes; `None` where there are none, or too many buffers are needed.
-    pub fn parts(&self, cap: u64) -> Option<Vec<FlowPart>> {
-        let (hull, unit, origin) = self.hull()?;
+    /// Parts of which every buffer is at most `cap` bytes.
+    ///
+    /// # Errors
+    /// There are none, or too many buffers are needed.
+    pub fn parts(&self, cap: u64) -> Result<Vec<FlowPart>, Unfit> {
+        let (hull, unit, origin) = self.hull().ok_or(Unfit::Kernel)?;
         let cells = hull.cells(origin, unit);
         let region = |lo: [usize; 3], shape: [usize; 3]| {
             let at = |a: usize, i: usize| origin[a] + (cells.lo[a] + i as i64) * unit[a] as i64;
@@ -144,16 +148,16 @@ impl Flow {
             lo_hi.clip(&hull)
         };
         // Each box is recorded once more when it is known to fit: recording takes microseconds.
-        let boxes = cut(cells.shape(), |lo, shape| {
-            self.part(&region(lo, shape), cap).is_none_or(|p| p.recording.sizes.largest() <= cap)
+        let boxes = cut_to(cells.shape(), cap, |lo, shape| {
+            Ok(self.part(&region(lo, shape), cap)?.map_or(Sizes::default(), |p| p.recording.sizes))
         })?;
-        let parts: Vec<FlowPart> =
-            boxes.into_iter().map(|(lo, shape)| self.part(&region(lo, shape), cap)).collect::<Option<_>>()?;
+        let made = boxes.into_iter().map(|(lo, shape)| self.part(&region(lo, shape), cap));
+        let parts: Vec<FlowPart> = made.filter_map(Result::transpose).collect::<Result<_, _>>()?;
         // A sweep's halo is large.
-        let sweeps = self.steps.iter().any(|s| matches!(s.kernel, Kernel::Sweep(_)));
-        let read: usize = parts.iter().map(|p| p.source.voxels()).sum();
-        let once = self.source()?.voxels();
-        (!sweeps || parts.len() == 1 || read <= MOST_REPEATED * once).then_some(parts)
+        if self.steps.iter().any(|s| matches!(s.kernel, Kernel::Sweep(_))) {
+            repeated(parts.iter().map(|p| p.source.voxels()), self.source().map_or(0, |s| s.voxels()))?;
+        }
+        Ok(parts)
     }
 
     /// Largest buffers of any part.
@@ -162,11 +166,11 @@ impl Flow {
         parts.iter().map(|p| p.recording.sizes).fold(Sizes::default(), Sizes::max)
     }
 
-    /// Records what of the flow lies in a box. `None` where that takes too many buffers.
-    fn part(&self, region: &Region, cap: u64) -> Option<FlowPart> {
+    /// Records what of the flow lies in a box; `None` where nothing does.
+    fn part(&self, region: &Region, cap: u64) -> Result<Option<FlowPart>, Unfit> {
         let own = |sink: &Sink| Some(sink.region.clip(region)).filter(|r| !r.is_empty());
-        let (source, boxes) = self.boxes(own)?;
-        let kind = stored(self.dtype)?;
+        let Some((source, boxes)) = self.boxes(own) else { return Ok(None) };
+        let kind = stored(self.dtype).ok_or(Unfit::Kernel)?;
         let pitch = source.shape()[2].next_multiple_of(4 / kind.voxel);
         let bytes = source.shape()[0] * source.shape()[1] * pitch * kind.voxel;
         let mut to = Recorder::new(bytes as u64);
@@ -187,7 +191,7 @@ impl Flow {
             state.release(s, &mut to);
         }
         let flag = flag.map(|f: Buffer| to.read(Bind::from(f), LOOKED));
-        Some(FlowPart { source, pitch, recording: to.finish()?, placed, flag })
+        Ok(Some(FlowPart { source, pitch, recording: to.finish()?, placed, flag }))
     }
 }
 

@@ -32,7 +32,7 @@ impl Gpu {
         outs: &mut [SinkOut],
     ) -> Result<Option<Times>, GpuError> {
         assert_eq!(outs.len(), flow.sinks.len(), "an output for each sink");
-        let Some(parts) = flow.parts(self.cap()) else { return Ok(None) };
+        let Ok(parts) = flow.parts(self.cap()) else { return Ok(None) };
         let voxel = stored(flow.dtype).map_or(0, |s| s.voxel);
         room(flow, outs);
         self.attempt(|device| {

@@ -12,6 +12,7 @@
 //! | `maps`, `occlusion` | occlusion maps recorded, and called |
 //! | `finish`, `points`, `levels` | results of windows, steps that look at one voxel, pyramids, recorded |
 //! | `flow`, `flow_steps`, `flow_call` | several steps and their levels recorded together, and called |
+//! | `unfit` | why work is not the device's |
 //! | `nodes` | whether a machine can have a GPU at all |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
@@ -45,12 +46,14 @@ pub mod slopes;
 mod slot;
 pub mod sweep;
 pub mod taps;
+mod unfit;
 mod windows;
 
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind};
 pub use flow_call::SinkOut;
 pub use occlusion::MapLevels;
+pub use unfit::Unfit;
 
 use crate::config::Device;
 

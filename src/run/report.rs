@@ -44,6 +44,8 @@ pub struct StageReport {
     /// Time in its kernels, summed over threads.
     pub seconds: f64,
     pub device: String,
+    /// Why it ran there.
+    pub reason: String,
     pub voxels: u64,
     /// Of a stage on the GPU: bricks that CPU workers took while all of its slots were taken.
     pub bricks_on_cpu: u64,

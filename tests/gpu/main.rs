@@ -5,6 +5,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod fits;
 mod float_windows;
 mod flow_runs;
 mod flows;
@@ -14,6 +15,7 @@ mod levels;
 mod maps;
 mod obscurance;
 mod runs;
+mod setup;
 mod windows;
 
 use std::sync::Mutex;

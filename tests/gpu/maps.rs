@@ -10,9 +10,9 @@ use occlude::kernel::Context;
 use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::occlusion_map::{Moments, base, coarsen};
 use occlude::kernel::simd::Level;
-use occlude::run::RunOptions;
 
-use super::common::{Decoded, assert_same, decode, mixed_u16, parse, run_with, u16_bytes, write_npy};
+use super::common::{Decoded, assert_same, decode};
+use super::setup::{CPU, SOFTWARE, folder, run_on};
 use super::{adapter, fills};
 
 const DTYPES: [DType; 4] = [DType::U8, DType::I8, DType::U16, DType::I16];
@@ -198,9 +198,8 @@ shard = 32
 "#;
 
 fn run(dir: &Path, sets: &[&str]) -> [Decoded; 2] {
-    let options = RunOptions { overwrite: true, ..Default::default() };
-    let report = run_with(&parse(dir, CONFIG, sets), &options);
-    let device = if sets.contains(&"run.device='cpu'") { "cpu" } else { "gpu" };
+    let report = run_on(dir, CONFIG, sets);
+    let device = if sets.contains(&CPU) { "cpu" } else { "gpu" };
     assert_eq!([&report.placement["map"], &report.placement["fine"]], [device; 2]);
     ["map", "fine"].map(|name| decode(&dir.join(format!("out/{name}.zarr"))))
 }
@@ -208,16 +207,13 @@ fn run(dir: &Path, sets: &[&str]) -> [Decoded; 2] {
 #[test]
 fn a_run_makes_maps_on_the_gpu_and_shows_no_brick() {
     let Some(_) = adapter() else { return };
-    let shape = [40, 70, 80];
-    let dir = tempfile::tempdir().unwrap();
-    write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
-    let software = "run.device='gpu:software'";
-    let cpu = run(dir.path(), &["run.device='cpu'"]);
-    let all = run(dir.path(), &[software]);
+    let dir = folder([40, 70, 80]);
+    let cpu = run(dir.path(), &[CPU]);
+    let all = run(dir.path(), &[SOFTWARE]);
     let sets: [&[&str]; 3] = [
-        &[software, "run.brick=[32, 16, 64]"],
-        &[software, "run.memory='40MiB'", "run.brick='auto'"],
-        &[software, "run.brick=[64, 96, 96]"],
+        &[SOFTWARE, "run.brick=[32, 16, 64]"],
+        &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"],
+        &[SOFTWARE, "run.brick=[64, 96, 96]"],
     ];
     for sets in sets {
         for (a, b) in all.iter().zip(run(dir.path(), sets)) {
