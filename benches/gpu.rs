@@ -267,6 +267,7 @@ fn flow(
         inputs: vec![*input],
         reach: *reach,
         padded: false,
+        fills: None,
     };
     Flow {
         dtype,
@@ -278,7 +279,7 @@ fn flow(
 }
 
 fn flow_on(gpu: &Gpu, flow: &Flow, src: AnyView, out: SinkOut) -> Result<Times, GpuError> {
-    let done = gpu.flow(flow, src, flow.volume, &mut [out]);
+    let done = gpu.flow(flow, src, flow.volume, &[], &mut [out]);
     done.map(|t| t.expect("noise lies within f32"))
 }
 

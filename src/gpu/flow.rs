@@ -5,9 +5,10 @@
 
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
+use super::masks::Mask;
 use super::passes::{cut_to, stored};
 use super::points::{LOOKED, Op};
-use super::record::{Bind, Buffer, Recording, Sizes};
+use super::record::{Bind, Buffer, Recording, Sizes, rounded};
 use super::recorder::Recorder;
 use super::slopes::Fit;
 use super::sweep::repeated;
@@ -58,6 +59,8 @@ pub struct FlowStep {
     pub reach: [usize; 3],
     /// What the host's voxels beyond the volume are, where the source has any; else windows end there.
     pub padded: bool,
+    /// Of a masked step, by channel: what stands where nothing is needed.
+    pub fills: Option<Vec<f32>>,
 }
 
 /// What becomes of a channel.
@@ -90,6 +93,8 @@ pub struct FlowPart {
     /// What the host packs, in rows of `pitch` voxels.
     pub source: Region,
     pub pitch: usize,
+    /// The masks behind it.
+    pub masks: Vec<Mask>,
     pub recording: Recording,
     /// By sink: the box that this part makes, and where it stands among what comes back.
     pub placed: Vec<Option<(Region, Placed)>>,
@@ -172,11 +177,21 @@ impl Flow {
         let Some((source, boxes)) = self.boxes(own) else { return Ok(None) };
         let kind = stored(self.dtype).ok_or(Unfit::Kernel)?;
         let pitch = source.shape()[2].next_multiple_of(4 / kind.voxel);
-        let bytes = source.shape()[0] * source.shape()[1] * pitch * kind.voxel;
-        let mut to = Recorder::new(bytes as u64);
+        let mut bytes = rounded((source.shape()[0] * source.shape()[1] * pitch * kind.voxel) as u64);
+        let mut masks = Vec::new();
+        for (step, region) in boxes.iter().enumerate().filter(|(s, _)| self.steps[*s].fills.is_some()) {
+            let Some(region) = *region else { continue };
+            masks.push(Mask { step, region, from: bytes });
+            bytes += masks[masks.len() - 1].bytes();
+        }
+        let mut to = Recorder::new(bytes);
         let slab = Slab { bind: Buffer::Source.into(), region: source, pitch };
-        let mut state =
-            State { flow: self, source: Made { slabs: vec![slab], stored: kind, affine: self.affine }, made: vec![] };
+        let mut state = State {
+            flow: self,
+            masks: &masks,
+            source: Made { slabs: vec![slab], stored: kind, affine: self.affine },
+            made: vec![],
+        };
         let mut placed = vec![None; self.sinks.len()];
         let mut flag = None;
         for (s, step) in self.steps.iter().enumerate() {
@@ -184,6 +199,9 @@ impl Flow {
                 Some(region) => step.record(&state, region, cap, &mut flag, &mut to)?,
                 None => Made::nothing(),
             };
+            if let (Some(mask), Some(fills)) = (state.mask(s), &step.fills) {
+                made.slabs.iter().zip(fills).for_each(|(slab, fill)| mask.fill(slab.bind, *fill, &mut to));
+            }
             state.made.push(made);
             for (sink, placed) in self.sinks.iter().zip(&mut placed).filter(|(sink, _)| sink.ready() == Some(s)) {
                 *placed = own(sink).map(|region| (region, state.deliver(sink, &region, &mut to)));
@@ -191,7 +209,7 @@ impl Flow {
             state.release(s, &mut to);
         }
         let flag = flag.map(|f: Buffer| to.read(Bind::from(f), LOOKED));
-        Ok(Some(FlowPart { source, pitch, recording: to.finish()?, placed, flag }))
+        Ok(Some(FlowPart { source, pitch, masks, recording: to.finish()?, placed, flag }))
     }
 }
 
@@ -214,6 +232,7 @@ impl Input {
 /// What is on the device while a part is recorded.
 pub(super) struct State<'a> {
     flow: &'a Flow,
+    masks: &'a [Mask],
     source: Made,
     made: Vec<Made>,
 }
@@ -227,12 +246,20 @@ impl State<'_> {
         }
     }
 
+    /// The mask of a step.
+    fn mask(&self, step: usize) -> Option<&Mask> {
+        self.masks.iter().find(|m| m.step == step)
+    }
+
     fn deliver(&self, sink: &Sink, region: &Region, to: &mut Recorder) -> Placed {
         let value = self.read(sink.value).slab;
         let mean = sink.mean.map(|m| self.read(m).slab);
         match &sink.pyramid {
-            Some(pyramid) => pyramid.record(&value, mean.as_ref(), region, to),
-            None => Pyramid::plain().record(&value, None, region, to),
+            Some(pyramid) => {
+                let mask = sink.value.step().and_then(|s| self.mask(s));
+                pyramid.record(&value, mean.as_ref(), mask, region, to)
+            }
+            None => Pyramid::plain().record(&value, None, None, region, to),
         }
     }
 

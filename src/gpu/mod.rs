@@ -10,6 +10,7 @@
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
 //! | `maps`, `occlusion` | occlusion maps recorded, and called |
+//! | `masks` | voxels that nobody needs |
 //! | `finish`, `points`, `levels` | results of windows, steps that look at one voxel, pyramids, recorded |
 //! | `flow`, `flow_steps`, `flow_call` | several steps and their levels recorded together, and called |
 //! | `unfit` | why work is not the device's |
@@ -32,6 +33,7 @@ mod gaussian;
 mod gradient;
 pub mod levels;
 pub mod maps;
+mod masks;
 mod nodes;
 mod obscurance;
 mod occlusion;
@@ -51,7 +53,7 @@ mod windows;
 
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind};
-pub use flow_call::SinkOut;
+pub use flow_call::{Needed, SinkOut};
 pub use occlusion::MapLevels;
 pub use unfit::Unfit;
 

@@ -35,11 +35,12 @@ pub enum Shader {
     LevelWrite,
     Point,
     Marks,
+    Masked,
     SweepCodes,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 17] = [
+    pub const ALL: [Shader; 18] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -56,6 +57,7 @@ impl Shader {
         Shader::LevelWrite,
         Shader::Point,
         Shader::Marks,
+        Shader::Masked,
         Shader::SweepCodes,
     ];
 
@@ -85,6 +87,7 @@ impl Shader {
             Shader::LevelWrite => composed!("common", "integers64", "double", "entries", "level_cells", "level_write"),
             Shader::Point => composed!("common", "integers64", "double", "point"),
             Shader::Marks => composed!("common", "marks"),
+            Shader::Masked => composed!("common", "masked"),
             Shader::SweepCodes => composed!("common", "sweep_codes"),
         }
     }
@@ -110,6 +113,7 @@ impl Shader {
             Shader::Finish | Shader::Codes => &["finish"],
             Shader::Point => &["point"],
             Shader::Marks => &["look"],
+            Shader::Masked => &["fill"],
             Shader::SweepCodes => &["code"],
             _ => &["first", "next"],
         }
@@ -119,8 +123,8 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Codes | Shader::Point => 5,
-            Shader::Obscurance | Shader::Finish => 4,
-            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool | Shader::LevelPool => 3,
+            Shader::Obscurance | Shader::Finish | Shader::LevelPool => 4,
+            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
             _ => 2,
         }
     }

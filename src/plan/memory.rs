@@ -165,7 +165,7 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
 pub fn inner_flow(plan: &Plan, flow: &flows::FlowPlan, group: &Group) -> Option<Flow> {
     let brick = inner(group.region, group.brick.shape, group.align);
     let (steps, outputs) = (&group.steps[..], &group.outputs[..]);
-    let site = flows::Site { steps, outputs, volume: group.shape, brick, globals: &[] };
+    let site = flows::Site { steps, outputs, volume: group.shape, brick, globals: &[], masked: flows::ALL_MASKED };
     Some(flows::build(plan, flow, &site)?.0)
 }
 

@@ -16,7 +16,7 @@ use super::outputs::{self, Start};
 use super::prepass::Finder;
 use super::program::Program;
 use super::read::Reader;
-use super::report::{Report, StageReport};
+use super::report::{self, Report};
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
@@ -97,7 +97,7 @@ impl<'a> Session<'a> {
             config,
             options,
             progress,
-            metrics: Metrics::new(plan.graph.steps.len()),
+            metrics: Metrics::new(plan.graph.steps.len(), plan.flows.len()),
             targets: plan.outputs.iter().map(|_| None).collect(),
             plan,
             gpu,
@@ -318,7 +318,7 @@ impl<'a> Session<'a> {
             found.add(&self.plan, &prepass.wires, done);
             Ok(Vec::new())
         };
-        let metrics = Metrics::new(self.plan.graph.steps.len());
+        let metrics = Metrics::new(self.plan.graph.steps.len(), self.plan.flows.len());
         let tick = || {
             let (bricks, voxels) = metrics.done();
             self.tick(
@@ -436,15 +436,7 @@ impl<'a> Session<'a> {
         self.metrics.fill(&mut report, self.plan.voxels());
         report.bricks.total = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
         report.memory_budget_bytes = self.plan.memory;
-        for (s, step) in self.plan.graph.steps.iter().enumerate() {
-            let (seconds, voxels) = self.metrics.step_totals(s);
-            let (_, device, reason) = &self.plan.placement[s];
-            let (device, reason) = (device.to_string(), reason.clone());
-            let bricks_on_cpu = self.metrics.shared_bricks(s);
-            let lines = self.metrics.line_counts(s);
-            let name = step.stages.join("+");
-            report.stages.push(StageReport { name, seconds, device, reason, voxels, bricks_on_cpu, lines });
-        }
+        report.stages = report::stages(&self.plan, &self.metrics);
         report.byte_identity_waived = self.plan.waives_byte_identity();
         report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();
         report

@@ -231,13 +231,14 @@ fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
 }
 
 #[test]
-fn masks_missing_voxels_and_borders_keep_steps_apart() {
+fn missing_voxels_borders_and_masks_of_what_is_made_keep_steps_apart() {
     let shape = [6, 7, 8];
     let dir = folder(shape);
     for (from, to, left) in [
         ("path = \"vol.npy\"", "path = \"vol.npy\"\nnodata = 7", &["slope"][..]),
-        ("sigma = 1.5", "sigma = 1.5\nwhere = { input = \"vol\", min = 9 }", &["slope"]),
-        ("input = \"bell.mean\"", "input = \"bell.mean\"\nwhere = { input = \"vol\", min = 9 }", &["bell"]),
+        ("sigma = 1.5", "sigma = 1.5\nwhere = { input = \"vol\", min = 9 }", &["bell slope"]),
+        ("input = \"bell.mean\"", "input = \"bell.mean\"\nwhere = { input = \"vol\", min = 9 }", &["bell slope"]),
+        ("input = \"bell.mean\"", "input = \"bell.mean\"\nwhere = { input = \"bell.mean\", min = 9 }", &["bell"]),
         ("sigma = 1.5", "sigma = 1.5\nborder = \"reflect\"", &["bell slope"]),
     ] {
         let text = CONFIG.replacen(from, to, 1);

@@ -251,7 +251,7 @@ fn flows_equal_their_steps_one_by_one_wherever_the_box_lies() {
                                 cells: false,
                                 ..pyramid.clone()
                             };
-                            let expect = on_cpu(&plain, &all[*s][*c], None, shape, region);
+                            let expect = on_cpu(&plain, &all[*s][*c], None, None, shape, region);
                             let text = differs(&expect, got);
                             assert_eq!(
                                 text, None,
@@ -259,7 +259,7 @@ fn flows_equal_their_steps_one_by_one_wherever_the_box_lies() {
                             );
                         }
                         let (s, c) = wanted[0];
-                        let expect = on_cpu(&pyramid, &all[s][c], None, shape, region);
+                        let expect = on_cpu(&pyramid, &all[s][c], None, None, shape, region);
                         assert_eq!(
                             differs(&expect, &got[wanted.len()]),
                             None,

@@ -13,6 +13,7 @@ mod gaussian;
 mod gradient;
 mod levels;
 mod maps;
+mod masks;
 mod obscurance;
 mod runs;
 mod setup;
