@@ -56,7 +56,7 @@ pub type Fill<'a> = &'a mut dyn FnMut(&mut wgpu::WriteOnly<[u8]>) -> bool;
 pub type Finish<'a> = &'a mut dyn FnMut(Option<&[u8]>) -> Result<(), GpuError>;
 
 impl Gpu {
-    /// Opens the best Vulkan adapter of this kind; the error says what was looked for and found.
+    /// Opens the best adapter of this kind; the error says what was looked for and found.
     pub fn open(kind: GpuKind) -> Result<Gpu, String> {
         Gpu::open_with(kind, false)
     }
@@ -71,7 +71,9 @@ impl Gpu {
         let cap = facts.most_bytes;
         let mut gpu =
             Gpu { kind, facts, timed, cap, device: Mutex::new(Some(Arc::new(device))), gone: AtomicBool::new(false) };
-        gpu.facts.exact_floats = gpu.probe().map_err(|e| format!("{} does not compute: {e}", gpu.facts.name))?;
+        let exact = gpu.probe().and_then(|exact| Ok((exact, gpu.probe_close(exact)?)));
+        (gpu.facts.exact_floats, gpu.facts.close_floats) =
+            exact.map_err(|e| format!("{} does not compute: {e}", gpu.facts.name))?;
         Ok(gpu)
     }
 

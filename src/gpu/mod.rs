@@ -15,12 +15,14 @@
 //! | `flow`, `flow_steps`, `flow_call` | several steps and their levels recorded together, and called |
 //! | `unfit` | why work is not the device's |
 //! | `nodes` | whether a machine can have a GPU at all |
+//! | `backend` | Vulkan, Metal or Direct3D 12 |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
 //! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
 //!
-//! Everything above `device` knows no wgpu.
+//! Everything above `backend` knows no wgpu.
 
+mod backend;
 pub mod device;
 pub mod engine;
 pub mod facts;

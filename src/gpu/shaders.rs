@@ -135,5 +135,5 @@ impl Shader {
     }
 }
 
-/// Most storage bindings of a shader; every Vulkan adapter has more.
+/// Most storage bindings of a shader; every adapter has more.
 pub const MOST_BINDINGS: u32 = 5;

@@ -238,13 +238,11 @@ fn join_flows(graph: &Graph, placement: &mut Placement) -> Vec<FlowPlan> {
 
 /// Whether a step on the GPU makes floats there that are not the CPU's bit for bit.
 fn floats(graph: &Graph, step: &graph::Step) -> bool {
-    let open = |c: &WindowChannel| matches!(c, WindowChannel::Openness(..));
-    exact(graph, step)
-        || match &step.kind {
-            graph::StepKind::Gradient { .. } => true,
-            graph::StepKind::Window { channels, .. } => channels.iter().any(open),
-            _ => false,
-        }
+    exact(graph, step) || Work::Step(step).close()
+}
+
+fn is_open(channel: &WindowChannel) -> bool {
+    matches!(channel, WindowChannel::Openness(..))
 }
 
 /// Whether a step needs [`GpuFacts::exact_floats`].
@@ -284,6 +282,7 @@ fn placement(
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
         (Some(Ok(gpu)), Ok(())) if exact && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if of.close() && !gpu.close_floats => ("cpu", facts::ROUGH.to_string()),
         (Some(Ok(gpu)), Ok(())) => match of.too_large(graph, gpu.buffer_cap(config.run.memory)) {
             Some(why) => ("cpu", why.to_string()),
             None => ("gpu", gpu.name.clone()),
@@ -310,6 +309,16 @@ enum Work<'a> {
 }
 
 impl Work<'_> {
+    /// Whether it needs [`GpuFacts::close_floats`].
+    fn close(self) -> bool {
+        let Work::Step(step) = self else { return false };
+        match &step.kind {
+            graph::StepKind::Gradient { .. } => true,
+            graph::StepKind::Window { channels, .. } => channels.iter().any(is_open),
+            _ => false,
+        }
+    }
+
     /// Why it stays on the CPU, where not even one voxel of it fits the device's buffers: floats must be one lane's.
     fn too_large(self, graph: &Graph, cap: u64) -> Option<&'static str> {
         match self {

@@ -225,6 +225,8 @@ fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
     assert_eq!(device("deviation").as_deref(), Some("gpu"));
     assert_eq!(device("exact").as_deref(), Some("cpu"));
     assert_eq!(report.placement["stats"], "gpu");
+    let why = |name: &str| report.stages.iter().find(|s| s.name == name).map(|s| s.reason.clone());
+    assert_eq!(why("exact").as_deref(), Some(facts::EXACT), "the report says why");
 }
 
 #[test]
@@ -275,6 +277,10 @@ fn placement_follows_the_device_and_says_why() {
     assert_eq!(place(&plan, "again"), ("cpu", facts::INEXACT));
     assert!(place(&plan, "exact").1.contains("exact"));
     let staging = plan.groups[0].brick.parked - parked;
+    let rough = GpuFacts { close_floats: false, ..setup::found() };
+    let (plan, _) = plan_with("run.device='auto'", Ok(rough)).unwrap();
+    assert_eq!(["mirrored", "again", "slope", "steps"].map(|s| place(&plan, s)), [("cpu", facts::ROUGH); 4]);
+    assert_eq!(["stats", "swept", "bell", "deviation"].map(|s| place(&plan, s).0), ["gpu"; 4]);
     let (plan, _) = plan_with("run.device='gpu:software'", Ok(found(true))).unwrap();
     assert_eq!(place(&plan, "bell"), ("gpu", "Test 9000"));
     assert_eq!(place(&plan, "again"), ("gpu", "Test 9000"));

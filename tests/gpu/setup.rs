@@ -31,7 +31,7 @@ pub fn run_on(dir: &Path, text: &str, sets: &[&str]) -> Report {
 
 /// An adapter that need not exist.
 pub fn found() -> GpuFacts {
-    GpuFacts { name: "Test 9000".into(), software: false, most_bytes: 1 << 30, exact_floats: true }
+    GpuFacts { name: "Test 9000".into(), software: false, most_bytes: 1 << 30, exact_floats: true, close_floats: true }
 }
 
 /// A plan with this adapter or none: the planner sees facts only, and asks for them once at most.
