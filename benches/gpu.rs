@@ -13,13 +13,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use occlude::brick::{Scratch, Voxels};
+use occlude::gpu::extend::Beyond;
 use occlude::gpu::facts::{SLOTS, tolerance};
 use occlude::gpu::flow::{Flow, FlowStep, Input, Kernel as Step, Sink};
 use occlude::gpu::levels::Pyramid;
 use occlude::gpu::slopes::Fit;
 use occlude::gpu::taps::Wanted;
 use occlude::gpu::{Gpu, GpuError, GpuKind, SinkOut, Times};
-use occlude::grid::{Affine, AnyView, AnyViewMut, DType, Region, Shape, ViewMut};
+use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut};
 use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::gradient::{GradientOut, gradient};
 use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
@@ -266,7 +267,7 @@ fn flow(
         kernel: kernel.clone(),
         inputs: vec![*input],
         reach: *reach,
-        padded: false,
+        beyond: Beyond { border: Border::Clip, outside: 0 },
         fills: None,
     };
     Flow {

@@ -3,6 +3,7 @@
 //!
 //! All boxes are in voxels of the volume. A part's boxes go from the sinks backward: each step makes what its readers see.
 
+use super::extend::Beyond;
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
 use super::masks::Mask;
@@ -57,8 +58,8 @@ pub struct FlowStep {
     pub inputs: Vec<Input>,
     /// Voxels that a window sees on each side.
     pub reach: [usize; 3],
-    /// What the host's voxels beyond the volume are, where the source has any; else windows end there.
-    pub padded: bool,
+    /// What windows see beyond the volume. Gradients see the nearest voxels, whatever stands here.
+    pub beyond: Beyond,
     /// Of a masked step, by channel: what stands where nothing is needed.
     pub fills: Option<Vec<f32>>,
 }
@@ -124,8 +125,7 @@ impl Flow {
         }
         for (s, step) in self.steps.iter().enumerate().rev() {
             let Some(region) = boxes[s] else { continue };
-            let seen = region.grow(step.reach);
-            let seen = if step.padded { seen } else { seen.clip(&self.volume) };
+            let seen = region.grow(step.reach).clip(&self.volume);
             step.inputs.iter().for_each(|&i| of(&mut boxes, i, seen));
         }
         source.map(|s| (s, boxes))
@@ -244,6 +244,10 @@ impl State<'_> {
             Input::Source => self.source.read(0),
             Input::Made { step, channel } => self.made[step].read(channel),
         }
+    }
+
+    pub fn volume(&self) -> &Region {
+        &self.flow.volume
     }
 
     /// The mask of a step.

@@ -81,8 +81,10 @@ impl FlowStep {
     ) -> Result<Made, Unfit> {
         let reads: Vec<Read> = self.inputs.iter().map(|i| state.read(*i)).collect();
         let read = *reads.first().ok_or(Unfit::Kernel)?;
+        let extended = self.extended(&read, region, state.volume(), to);
+        let read = extended.unwrap_or(read);
         let window = Window { read, dtype: read.stored.dtype(), region: *region };
-        match &self.kernel {
+        let made = match &self.kernel {
             Kernel::Gaussian { sigma, wanted } => window.gaussian(*sigma, *wanted, to).ok_or(Unfit::Kernel),
             Kernel::Gradient { fit, magnitude, vector } => {
                 window.gradient(fit, [*magnitude, *vector], flag, to).ok_or(Unfit::Kernel)
@@ -97,6 +99,18 @@ impl FlowStep {
                 }
                 Ok(Made::planes(&planes, ops.len(), region))
             }
+        };
+        extended.iter().for_each(|r| to.give(r.slab.bind.buffer));
+        made
+    }
+
+    /// What windows with a border rule read.
+    fn extended(&self, read: &Read, region: &Region, volume: &Region, to: &mut Recorder) -> Option<Read> {
+        match self.kernel {
+            Kernel::Windows { .. } | Kernel::Gaussian { .. } => {
+                self.beyond.record(read, &region.grow(self.reach), volume, to)
+            }
+            _ => None,
         }
     }
 }

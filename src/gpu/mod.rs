@@ -10,7 +10,7 @@
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
 //! | `maps`, `occlusion` | occlusion maps recorded, and called |
-//! | `masks` | voxels that nobody needs |
+//! | `masks`, `extend` | voxels that nobody needs, what lies beyond the volume |
 //! | `finish`, `points`, `levels` | results of windows, steps that look at one voxel, pyramids, recorded |
 //! | `flow`, `flow_steps`, `flow_call` | several steps and their levels recorded together, and called |
 //! | `unfit` | why work is not the device's |
@@ -25,6 +25,7 @@
 mod backend;
 pub mod device;
 pub mod engine;
+pub mod extend;
 pub mod facts;
 pub mod finish;
 mod float_windows;

@@ -36,11 +36,12 @@ pub enum Shader {
     Point,
     Marks,
     Masked,
+    Extend,
     SweepCodes,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 18] = [
+    pub const ALL: [Shader; 19] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -58,6 +59,7 @@ impl Shader {
         Shader::Point,
         Shader::Marks,
         Shader::Masked,
+        Shader::Extend,
         Shader::SweepCodes,
     ];
 
@@ -88,6 +90,7 @@ impl Shader {
             Shader::Point => composed!("common", "integers64", "double", "point"),
             Shader::Marks => composed!("common", "marks"),
             Shader::Masked => composed!("common", "masked"),
+            Shader::Extend => composed!("common", "extend"),
             Shader::SweepCodes => composed!("common", "sweep_codes"),
         }
     }
@@ -114,6 +117,7 @@ impl Shader {
             Shader::Point => &["point"],
             Shader::Marks => &["look"],
             Shader::Masked => &["fill"],
+            Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
             _ => &["first", "next"],
         }

@@ -5,6 +5,7 @@ use super::graph::{GradientChannel, Graph, Moment, Producer, Step, StepId, StepK
 use super::memory::wire_box;
 use super::{Group, OutputPlan, Plan};
 use crate::brick::Voxels;
+use crate::gpu::extend::Beyond;
 use crate::gpu::finish::Channels;
 use crate::gpu::flow::{Flow, FlowStep, Input, Kernel, Sink};
 use crate::gpu::levels::Pyramid;
@@ -52,20 +53,7 @@ pub fn find(graph: &Graph, on_gpu: &[bool]) -> Vec<FlowPlan> {
             continue;
         }
         let Some(at) = flow_of(graph, &mut flows, step, point) else { continue };
-        let over_source = step.inputs.iter().any(|&w| flows[at].source == w);
-        if !over_source && !reads_made(graph, step) {
-            continue;
-        }
         flows[at].steps.push(s);
-    }
-    // Where a step's windows look beyond the volume the host gives what is there, which others must not see.
-    for flow in &mut flows {
-        let reads = |s: &StepId| graph.steps[*s].inputs.contains(&flow.source);
-        let many = flow.steps.iter().filter(|s| reads(s)).count() > 1;
-        if many && flow.steps.iter().any(|s| padded(&graph.steps[*s])) {
-            let out: Vec<StepId> = flow.steps.iter().copied().filter(|s| padded(&graph.steps[*s])).collect();
-            leave(graph, flow, out);
-        }
     }
     flows.retain(|f| f.steps.iter().any(|&s| on_gpu[s]));
     flows
@@ -116,24 +104,23 @@ fn is_source(wire: &Wire) -> bool {
     wire.components == 1 && wire.missing.is_none() && stored(wire.dtype).is_some()
 }
 
-/// Whether a step with windows can read what others made on the device.
-fn reads_made(graph: &Graph, step: &Step) -> bool {
-    matches!(step.border, Border::Clip) || matches!(step.kind, StepKind::Gradient { .. }) || {
-        !ops(graph, step, &[]).is_empty()
-    }
-}
-
 /// Whether a step's mask, if it has one, is known before anything is made: it hangs on an input.
 fn mask_is_read(graph: &Graph, step: &Step) -> bool {
     step.mask.as_ref().is_none_or(|m| matches!(graph.wires[m.wire].producer, Producer::Input(_)))
 }
 
-/// Whether the host gives a step's voxels beyond the volume.
-fn padded(step: &Step) -> bool {
-    match step.kind {
-        StepKind::Window { .. } | StepKind::Gaussian { .. } => step.border != Border::Clip,
-        _ => false,
+/// What a step's windows see beyond the volume, as the channel that they read has it on the device.
+fn beyond(graph: &Graph, step: &Step, made: bool) -> Beyond {
+    if step.border == Border::Clip {
+        return Beyond { border: Border::Clip, outside: 0 };
     }
+    let wire = &graph.wires[step.inputs[0]];
+    let (outside, _) = wire.beyond(step.border);
+    let mut one = Voxels::zeroed(if made { DType::F32 } else { wire.dtype }, 1);
+    one.fill(outside);
+    let mut bits = [0; 4];
+    bits[..one.as_bytes().len()].copy_from_slice(one.as_bytes());
+    Beyond { border: step.border, outside: u32::from_le_bytes(bits) }
 }
 
 /// Whether a flow has a kernel for a step with windows; its input's type was looked at when it was placed.
@@ -239,7 +226,7 @@ pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Tar
             kernel: kernel(graph, step, site.globals),
             inputs: inputs.map(|(w, c)| input(w, c)).collect(),
             reach: step.reach,
-            padded: padded(step),
+            beyond: beyond(graph, step, at(step.inputs[0]).is_some()),
             fills: (step.mask.is_some() && (site.masked)(s)).then(|| fills(graph, step)),
         }
     };

@@ -80,10 +80,7 @@ impl Engine<'_> {
             Some(Needed { step, view: View::dense(mask, region.shape()), region })
         });
         let needed: Vec<Needed> = needed.collect();
-        let done = match recipe.steps.iter().position(|s| s.padded) {
-            None => gpu.flow(&recipe, value.view(0, value.region), value.region, &needed, &mut outs),
-            Some(_) => self.padded_flow(gpu, &recipe, program, flow, value, brick, &needed, &mut outs),
-        };
+        let done = gpu.flow(&recipe, value.view(0, value.region), value.region, &needed, &mut outs);
         drop(outs);
         if done.map_err(failed)?.is_none() {
             plan.flow_of(flow.steps[0]).into_iter().for_each(|f| self.metrics.flow_left(f));
@@ -92,31 +89,6 @@ impl Engine<'_> {
         }
         let done = collect(rooms, &targets, &recipe, |w| plan.graph.wires[w].dtype);
         Ok(Some(FlowDone { steps: flow.steps.clone(), ..done }))
-    }
-
-    /// A flow of which the one step that reads the source sees voxels beyond the volume.
-    #[allow(clippy::too_many_arguments)]
-    fn padded_flow(
-        &self,
-        gpu: &Gpu,
-        recipe: &Flow,
-        program: &Program,
-        flow: &FlowPlan,
-        value: &Value,
-        brick: Region,
-        needed: &[Needed],
-        outs: &mut [SinkOut],
-    ) -> std::result::Result<Option<crate::gpu::Times>, crate::gpu::GpuError> {
-        let graph = &self.plan.graph;
-        let reads = |s: &&StepId| graph.steps[**s].inputs.contains(&flow.source) && program.steps.contains(s);
-        let Some(&s) = flow.steps.iter().find(reads) else { return Ok(None) };
-        let step = &graph.steps[s];
-        let region = program.step_box(self.plan, s, brick);
-        let volume = Region::whole(program.volume);
-        let src = self.windowed(step, step.border, value, 0, &graph.wires[flow.source], region, volume);
-        let done = gpu.flow(recipe, src.view(), region.grow(step.reach), needed, outs);
-        src.recycle(self.pool);
-        done
     }
 
     /// The GPU, unless all of the steps' bricks may go to either lane and it is busy. The bits are the same.

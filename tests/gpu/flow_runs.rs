@@ -231,7 +231,7 @@ fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
 }
 
 #[test]
-fn missing_voxels_borders_and_masks_of_what_is_made_keep_steps_apart() {
+fn missing_voxels_and_masks_of_what_is_made_keep_steps_apart() {
     let shape = [6, 7, 8];
     let dir = folder(shape);
     for (from, to, left) in [
@@ -245,7 +245,77 @@ fn missing_voxels_borders_and_masks_of_what_is_made_keep_steps_apart() {
         assert_ne!(text, CONFIG);
         assert_eq!(flows(dir.path(), &text), left, "{to}");
     }
-    // Beyond the edge of the volume a window sees means that the border's rule makes of means: those come back.
+    // Beyond the edge of the volume a window sees means that the border's rule makes of means, there.
     let mirrored = with_windows().replacen("radius =", "border = \"reflect\"\nradius =", 1);
-    assert_eq!(flows(dir.path(), &mirrored), ["bell"]);
+    assert_eq!(flows(dir.path(), &mirrored), ["bell slope"]);
+    // A constant that the type cannot hold makes floats of the voxels.
+    let constant = CONFIG.replacen("sigma = 1.5", "sigma = 1.5\nborder = { constant = 0.5 }", 1);
+    assert_eq!(flows(dir.path(), &constant), ["slope"]);
+}
+
+/// Steps of every border over one input and over what is made of it.
+const BORDERS: &str = r#"
+[run]
+threads = 2
+brick = [16, 32, 32]
+[input.vol]
+path = "vol.npy"
+[stage.plain]
+op = "box"
+input = "vol"
+radius = [2, 3, 5]
+[stage.mirrored]
+op = "box"
+input = "vol"
+radius = [4, 4, 9]
+border = "reflect"
+[stage.walled]
+op = "box"
+input = "vol"
+radius = 3
+border = { constant = 900 }
+where = { input = "vol", min = 3000 }
+[stage.held]
+op = "gaussian"
+input = "vol"
+sigma = 1.2
+border = "nearest"
+[stage.sum]
+op = "combine"
+op_kind = "add"
+inputs = ["plain.mean", "mirrored.mean", "walled.max"]
+[output.sum]
+path = "out/sum.zarr"
+from = "sum"
+chunk = 8
+[output.var]
+path = "out/var.zarr"
+from = "mirrored.variance"
+reduce = "moments"
+chunk = 8
+[output.held]
+path = "out/held.zarr"
+from = "held.mean"
+chunk = 8
+"#;
+
+#[test]
+fn steps_of_every_border_run_in_one_go_and_equal_the_cpus() {
+    let shape = [30, 40, 50];
+    let [cpu, gpu] = [0, 1].map(|_| folder(shape));
+    assert_eq!(flows(gpu.path(), BORDERS), ["plain mirrored walled held sum"]);
+    let Some(_) = adapter() else { return };
+    run_on(cpu.path(), BORDERS, &[CPU]);
+    for (what, sets) in [
+        ("bricks as given", &[SOFTWARE][..]),
+        ("a little memory", &[SOFTWARE, "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]),
+    ] {
+        let report = run_on(gpu.path(), BORDERS, sets);
+        let row = report.stages.iter().find_map(|s| s.together.clone()).unwrap();
+        assert!(row.bricks > 1 && row.bricks_left == 0, "{what}: {row:?}");
+        for name in ["sum", "var", "held"] {
+            let [a, b] = [&cpu, &gpu].map(|d| decode(&d.path().join(format!("out/{name}.zarr"))));
+            assert_same(&format!("{what}: {name}"), &a, &b);
+        }
+    }
 }

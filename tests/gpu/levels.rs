@@ -1,11 +1,12 @@
 //! Levels, conversions and steps that look at one voxel, made on the GPU, equal the CPU's bit for bit.
 
 use occlude::brick::{Scratch, Voxels, gather};
+use occlude::gpu::extend::Beyond;
 use occlude::gpu::flow::{Flow, FlowStep, Input, Kernel, Sink};
 use occlude::gpu::levels::Pyramid;
 use occlude::gpu::points::Op;
 use occlude::gpu::{Gpu, Needed, SinkOut};
-use occlude::grid::{Affine, AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
+use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut};
 use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::obscurance::Prepared;
 use occlude::kernel::reduce::{Cells, Level0};
@@ -41,6 +42,9 @@ pub fn flow_of(dtype: DType, affine: Affine, shape: Shape, steps: Vec<FlowStep>,
     Flow { dtype, affine, volume: Region::whole(shape), steps, sinks }
 }
 
+/// Windows end where the volume does.
+pub const CLIP: Beyond = Beyond { border: Border::Clip, outside: 0 };
+
 pub fn step(kernel: Kernel, inputs: &[Input]) -> FlowStep {
     let reach = match &kernel {
         Kernel::Gaussian { sigma, .. } => sigma.map(|s| (3.0 * s).ceil() as usize),
@@ -49,7 +53,7 @@ pub fn step(kernel: Kernel, inputs: &[Input]) -> FlowStep {
         Kernel::Sweep(params) => Prepared::new(params).reach(),
         Kernel::Points(_) => [0; 3],
     };
-    FlowStep { kernel, inputs: inputs.to_vec(), reach, padded: false, fills: None }
+    FlowStep { kernel, inputs: inputs.to_vec(), reach, beyond: CLIP, fills: None }
 }
 
 pub fn made(step: usize, channel: usize) -> Input {
