@@ -1,12 +1,9 @@
 //! Windows: how a call is cut into parts that fit the device, and the three passes of each quantity. Pure arithmetic,
 //! shared by planner and engine.
 
-use std::cell::Cell;
-
 use super::finish::Channels;
 use super::record::{Bind, Buffer, Recording, Shader, Sizes};
 use super::recorder::{Planes, Recorder};
-use super::unfit::Unfit;
 use crate::grid::{DType, Shape};
 use crate::kernel::window::Needs;
 use crate::stage::{WindowChannel, WindowParams};
@@ -370,38 +367,6 @@ pub fn parts_within<P>(
 /// Largest buffers of any part.
 pub fn largest<P>(parts: Option<Vec<P>>, sizes: impl Fn(&P) -> Sizes) -> Sizes {
     parts.unwrap_or_default().iter().map(sizes).fold(Sizes::default(), Sizes::max)
-}
-
-/// As [`cut`], into boxes that can be recorded with every buffer at most `cap` bytes.
-///
-/// # Errors
-/// Why the least box cannot, or any for another reason than bytes.
-pub fn cut_to(
-    shape: Shape,
-    cap: u64,
-    sizes: impl Fn([usize; 3], Shape) -> Result<Sizes, Unfit>,
-) -> Result<Vec<([usize; 3], Shape)>, Unfit> {
-    let (large, never) = (Cell::new(None), Cell::new(None));
-    let boxes = cut(shape, |lo, shape| match sizes(lo, shape) {
-        Ok(sizes) if sizes.largest() <= cap => true,
-        Ok(sizes) => {
-            large.set(Some(Unfit::Bytes { needed: sizes.largest(), cap }));
-            false
-        }
-        Err(why @ Unfit::Bytes { .. }) => {
-            large.set(Some(why));
-            false
-        }
-        // No smaller box mends it.
-        Err(why) => {
-            never.set(Some(why));
-            true
-        }
-    });
-    match never.get() {
-        Some(why) => Err(why),
-        None => boxes.ok_or(large.get().unwrap_or(Unfit::Kernel)),
-    }
 }
 
 /// Boxes (first voxel, extent) that tile `shape` and fit: halves along z first. `None` where even one voxel does not fit.

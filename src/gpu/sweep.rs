@@ -1,10 +1,10 @@
 //! Obscurance: how a brick is cut into parts that fit the device, the tables of displacements and contributions, and one
 //! dispatch (or a few) per family of lines. Pure arithmetic, shared by planner and engine.
 
-use super::passes::{Stored, cut_to};
+use super::passes::Stored;
 use super::record::{Bind, Buffer, GROUP, Recording, Shader, Sizes};
 use super::recorder::Recorder;
-use super::unfit::Unfit;
+use super::unfit::{Unfit, cut_to};
 use crate::grid::{DType, Region, Shape};
 use crate::kernel::obscurance::{Prepared, shared};
 

@@ -1,9 +1,12 @@
 //! Why work is not the device's, with the numbers.
 
+use std::cell::Cell;
 use std::fmt;
 
-use super::record::WORK;
+use super::passes::cut;
+use super::record::{Sizes, WORK};
 use super::sweep::MOST_REPEATED;
+use crate::grid::Shape;
 
 /// What keeps a call from the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,6 +38,38 @@ impl fmt::Display for Unfit {
                 )
             }
         }
+    }
+}
+
+/// As [`cut`], into boxes that can be recorded with every buffer at most `cap` bytes.
+///
+/// # Errors
+/// Why the least box cannot, or any for another reason than bytes.
+pub fn cut_to(
+    shape: Shape,
+    cap: u64,
+    sizes: impl Fn([usize; 3], Shape) -> Result<Sizes, Unfit>,
+) -> Result<Vec<([usize; 3], Shape)>, Unfit> {
+    let (large, never) = (Cell::new(None), Cell::new(None));
+    let boxes = cut(shape, |lo, shape| match sizes(lo, shape) {
+        Ok(sizes) if sizes.largest() <= cap => true,
+        Ok(sizes) => {
+            large.set(Some(Unfit::Bytes { needed: sizes.largest(), cap }));
+            false
+        }
+        Err(why @ Unfit::Bytes { .. }) => {
+            large.set(Some(why));
+            false
+        }
+        // No smaller box mends it.
+        Err(why) => {
+            never.set(Some(why));
+            true
+        }
+    });
+    match never.get() {
+        Some(why) => Err(why),
+        None => boxes.ok_or(large.get().unwrap_or(Unfit::Kernel)),
     }
 }
 

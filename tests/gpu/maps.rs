@@ -47,13 +47,20 @@ fn on_cpu(volume: &Voxels, levels: &[MapLevel], affine: Affine) -> Vec<Moments> 
 
 /// The same over a brick by the device, from no more than it needs.
 fn on_gpu(gpu: &Gpu, volume: &Voxels, levels: &[MapLevel], brick: Region, affine: Affine) -> Vec<Moments> {
+    (2..=levels.len()).map(|count| last_on_gpu(gpu, volume, &levels[..count], brick, affine)).collect()
+}
+
+/// Of the last of these levels alone.
+fn last_on_gpu(gpu: &Gpu, volume: &Voxels, levels: &[MapLevel], brick: Region, affine: Affine) -> Moments {
     let job = MapJob::new(volume.dtype(), levels.to_vec()).unwrap();
     let read = job.boxes(brick)[0];
     let mut part = Voxels::zeroed(volume.dtype(), read.voxels());
     let whole = Region::whole(levels[0].shape);
     gather::copy_common(volume.view(levels[0].shape), whole, part.view_mut(read.shape()), read);
-    let made = gpu.occlusion_levels(part.view(read.shape()), read, &job, brick, affine);
-    made.unwrap_or_else(|e| panic!("{e}")).0
+    let (first, dtype, mapping) = (levels.len(), DType::F32, Mapping::KEEP);
+    let codes = MapCodes { first, moments: vec![], dtype, mapping, affine, cells: true };
+    let made = gpu.occlusion_codes(part.view(read.shape()), read, &job, brick, &codes);
+    made.unwrap_or_else(|e| panic!("{e}")).last.expect("the last level's cells are asked for")
 }
 
 /// The first cell that lies further from the CPU's than the tolerance; of two lanes' levels over the whole volume.
@@ -248,7 +255,7 @@ fn codes_are_those_of_the_levels_bit_for_bit() {
                 let job = MapJob::new(dtype, list.clone()).unwrap();
                 let view = volume.view(shape);
                 gpu.set_cap(1 << 30);
-                let (moments, _) = gpu.occlusion_levels(view, brick, &job, brick, affine).unwrap();
+                let moments = on_gpu(&gpu, &volume, &list, brick, affine);
                 let mapping = Mapping { range, fill: 3.0 };
                 let codes = MapCodes { first: 2, moments: vec![1, 0], dtype: to, mapping, affine, cells: true };
                 for cap in [1 << 30, 60_000] {
