@@ -1,7 +1,7 @@
 //! The GPU lane beside the CPU kernels (one thread) on the same brick, and a stream of bricks beside the sum of its parts.
 //!
-//! `cargo bench --bench gpu [-- WORD ...]` (only rows that hold a word, such as `gradient` or `f32`): uses a hardware adapter,
-//! else a software one, and says which. Figures of a software adapter (lavapipe) say nothing about a GPU's speed. Results are
+//! `cargo bench --bench gpu [-- WORD ...]` (only rows that hold a word, such as `gradient` or `f32`; without words
+//! benches/gpu_rivals.py runs at the end): uses a hardware adapter, else a software one, and says which. Figures of a software adapter (lavapipe) say nothing about a GPU's speed. Results are
 //! compared with the CPU's before a time is printed; a wrong one ends the bench.
 //!
 //! Columns, in ms: by the wall clock `pack` (host writes voxels into the mapped staging buffer), `device` (from submission
@@ -13,13 +13,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use occlude::brick::{Scratch, Voxels};
+use occlude::gpu::extend::Beyond;
 use occlude::gpu::facts::{SLOTS, tolerance};
 use occlude::gpu::flow::{Flow, FlowStep, Input, Kernel as Step, Sink};
 use occlude::gpu::levels::Pyramid;
 use occlude::gpu::slopes::Fit;
 use occlude::gpu::taps::Wanted;
 use occlude::gpu::{Gpu, GpuError, GpuKind, SinkOut, Times};
-use occlude::grid::{Affine, AnyView, AnyViewMut, DType, Region, Shape, ViewMut};
+use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, ViewMut};
 use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::gradient::{GradientOut, gradient};
 use occlude::kernel::obscurance::{ObscuranceIo, ObscuranceParams, Prepared};
@@ -266,7 +267,8 @@ fn flow(
         kernel: kernel.clone(),
         inputs: vec![*input],
         reach: *reach,
-        padded: false,
+        beyond: Beyond { border: Border::Clip, outside: 0 },
+        fills: None,
     };
     Flow {
         dtype,
@@ -278,7 +280,7 @@ fn flow(
 }
 
 fn flow_on(gpu: &Gpu, flow: &Flow, src: AnyView, out: SinkOut) -> Result<Times, GpuError> {
-    let done = gpu.flow(flow, src, flow.volume, &mut [out]);
+    let done = gpu.flow(flow, src, flow.volume, &[], &mut [out]);
     done.map(|t| t.expect("noise lies within f32"))
 }
 
@@ -379,7 +381,7 @@ fn sweep_on(
 /// Bricks per second with as many threads as the ring has slots, beside one thread and beside the slowest phase alone.
 fn stream(gpu: &Gpu, case: &Case, volume: &Voxels, shape: Shape) {
     const BRICKS: usize = 12;
-    let run = |threads: usize| {
+    let run = |gpu: Option<&Gpu>, threads: usize| {
         let next = AtomicUsize::new(0);
         let sum = Mutex::new(Times::default());
         let start = Instant::now();
@@ -389,7 +391,7 @@ fn stream(gpu: &Gpu, case: &Case, volume: &Voxels, shape: Shape) {
                     let mut out = case.outputs(volume.dtype(), shape);
                     let mut scratch = Scratch::new();
                     while next.fetch_add(1, Ordering::Relaxed) < BRICKS {
-                        let (_, t) = case.call(Some(gpu), volume, shape, &mut out, &mut scratch);
+                        let (_, t) = case.call(gpu, volume, shape, &mut out, &mut scratch);
                         let mut sum = sum.lock().expect("no thread panics");
                         (sum.pack, sum.finish) = (sum.pack + t.pack, sum.finish + t.finish);
                         (0..3).for_each(|k| sum.stamps[k] += t.stamps[k]);
@@ -399,11 +401,13 @@ fn stream(gpu: &Gpu, case: &Case, volume: &Voxels, shape: Shape) {
         });
         (BRICKS as f64 / start.elapsed().as_secs_f64(), sum.into_inner().expect("no thread panics"))
     };
-    let (one, _) = run(1);
-    let (ring, t) = run(SLOTS as usize);
+    let (one, _) = run(Some(gpu), 1);
+    let (ring, t) = run(Some(gpu), SLOTS as usize);
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let [(cpu, _), (all, _)] = [1, cores].map(|threads| run(None, threads));
     let parts = [t.pack, t.finish, t.stamps.iter().sum()].map(|s| s * 1e3 / BRICKS as f64);
     println!(
-        "{:<22} {:<4} {one:>10.1} {ring:>10.1} {:>8.1} {:>8.1} {:>8.1}",
+        "{:<22} {:<4} {one:>10.1} {ring:>10.1} {:>8.1} {:>8.1} {:>8.1} {cpu:>10.1} {all:>10.1}",
         case.name,
         volume.dtype().name(),
         parts[0],
@@ -468,16 +472,35 @@ fn main() {
         }
     }
     println!(
-        "stream of bricks of {size}^3: bricks/s by one thread and by {SLOTS}, then ms per brick of host and device alone"
+        "stream of bricks of {size}^3: bricks/s by one thread and by {SLOTS}, then ms per brick of host and device alone, then \
+         the CPU's bricks/s by one thread and by all"
     );
     println!(
-        "{:<22} {:<4} {:>10} {:>10} {:>8} {:>8} {:>8}",
-        "kernel", "type", "1 thread", "ring", "pack", "finish", "device"
+        "{:<22} {:<4} {:>10} {:>10} {:>8} {:>8} {:>8} {:>10} {:>10}",
+        "kernel", "type", "1 thread", "ring", "pack", "finish", "device", "cpu", "cpu, all"
     );
     let volume = noise(DType::U8, shape);
     for case in cases().iter().filter(|c| {
-        ["cdf_power r=10", "cdf_power r=10, levels", "gradient of s=2", "obscurance 42 d=64"].contains(&c.name.as_str())
+        let streamed = ["cdf_power r=10", "cdf_power r=10, levels", "gradient of s=2", "obscurance 42 d=64"];
+        streamed.contains(&c.name.as_str()) && wanted(c, DType::U8)
     }) {
         stream(&gpu, case, &volume, shape);
+    }
+    if words.is_empty() {
+        rivals();
+    }
+}
+
+/// The same by CuPy and torch, where they are; the script says what it lacks.
+fn rivals() {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/gpu_rivals.py");
+    println!("\n{script}:");
+    match std::process::Command::new("python3").arg(script).status() {
+        Ok(status) if status.success() || status.code() == Some(3) => {}
+        Ok(status) => {
+            println!("failed: {status}");
+            std::process::exit(1);
+        }
+        Err(e) => println!("not measured: python3 cannot be run: {e}"),
     }
 }

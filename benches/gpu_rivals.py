@@ -2,8 +2,8 @@
 """CuPy's uniform, minimum, maximum and Gaussian filters and gradients and torch's pooling on a GPU, beside `cargo bench
 --bench gpu`.
 
-    pip install numpy cupy-cuda12x torch
-    cargo bench --bench gpu && python benches/gpu_rivals.py
+    pip install numpy scipy cupy-cuda12x torch
+    cargo bench --bench gpu     # runs this script at its end
 
 The same extents, radii and types as the bench, noise, medians of ten after a warm-up, by events of the device; copies to
 and from the device are timed apart. CuPy with mode "nearest" and its default "reflect". torch pools floats only, pads with

@@ -9,6 +9,9 @@ const SPREAD: u32 = 5u; // moments of a channel that is a standard deviation
 const MAP_MEAN: u32 = 6u; // of an occlusion map's cells (map_pool.wgsl)
 const MAP_VARIANCE: u32 = 7u;
 
+// Set in a cell's count where it covers only voxels that a mask excludes.
+const EXCLUDED: u32 = 0x80000000u;
+
 // Unrounded: a sum (of means) or one of the values, voxels that entered, and of moments the sum of the voxels' variances and
 // the sum of squared deviations of their means.
 struct Cell {
@@ -37,5 +40,5 @@ fn cell_from(index: u32, kind: u32) -> Cell {
 }
 
 fn count_of(n: u32) -> vec2<u32> {
-    return of_integer(vec2<u32>(n, 0u));
+    return of_integer(vec2<u32>(n & ~EXCLUDED, 0u));
 }

@@ -4,7 +4,8 @@
 // Agrees bit for bit with src/kernel/reduce (Cells): the same tree, in f64 (double.wgsl). Parameters: src/gpu/levels.rs,
 // struct Join.
 // Bindings, group 0: 0 uniform Join; 1 storage, read: bits of f32 voxels (`first`) or cells (`next`); 2 storage, written: cells
-// of 3 words (value, voxels) or 7 (and inner, between); 3 storage, read: bits of f32 means beside the voxels (moments).
+// of 3 words (value, voxels) or 7 (and inner, between); 3 storage, read: bits of f32 means beside the voxels (moments); 4 storage,
+// read: bytes of a mask of the voxels, 1 where one is needed.
 // Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no atomics: an output has one writer.
 
 struct Join {
@@ -25,18 +26,27 @@ struct Join {
     mean_row: u32,
     kind: u32,
     threads: u32,
-    spare_0: u32,
-    spare_1: u32,
-    spare_2: u32,
+    mask_start: u32, // the same of the mask, in bytes
+    mask_plane: u32,
+    mask_row: u32,   // 0: there is none
 }
 
 @group(0) @binding(0) var<uniform> p: Join;
 @group(0) @binding(1) var<storage, read> input: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> means: array<u32>;
+@group(0) @binding(4) var<storage, read> needed: array<u32>;
 
 fn is_nan32(bits: u32) -> bool {
     return (bits & 0x7fffffffu) > 0x7f800000u;
+}
+
+fn is_excluded(z: u32, y: u32, x: u32) -> bool {
+    if p.mask_row == 0u {
+        return false;
+    }
+    let at = p.mask_start + z * p.mask_plane + y * p.mask_row + x;
+    return unpacked(needed[at / 4u], at, 2u) == 0u;
 }
 
 // A voxel of which the value, or the mean or variance, is NaN does not count; where values are chosen NaN itself says so.
@@ -62,7 +72,9 @@ fn voxel_at(z: u32, y: u32, x: u32) -> Cell {
 
 fn finer(z: u32, y: u32, x: u32, voxels: bool) -> Cell {
     if voxels {
-        return voxel_at(z, y, x);
+        var cell = voxel_at(z, y, x);
+        cell.n |= select(0u, EXCLUDED, is_excluded(z, y, x));
+        return cell;
     }
     return cell_from((z * p.in_y + y) * p.in_x + x, p.kind);
 }
@@ -95,7 +107,7 @@ fn plus(a: Cell, b: Cell) -> Cell {
 }
 
 fn mean_of(cell: Cell) -> vec2<u32> {
-    return quotient_of(cell.value, count_of(max(cell.n, 1u)));
+    return quotient_of(cell.value, count_of(max(cell.n & ~EXCLUDED, 1u)));
 }
 
 // A finer cell whose deviations are taken from another mean.
@@ -111,19 +123,36 @@ const RIGHT: array<u32, 7> = array<u32, 7>(1u, 3u, 5u, 7u, 2u, 6u, 4u);
 // By z, then y, then x.
 const IN_TURN: array<u32, 8> = array<u32, 8>(0u, 4u, 1u, 5u, 2u, 6u, 3u, 7u);
 
-// All that a cell covers; with their deviations from its mean.
+// What a finer cell of excluded voxels leaves in one that covers others.
+fn left_out() -> Cell {
+    var cell = Cell();
+    if p.kind != MEAN && p.kind < MOMENTS {
+        cell.value = vec2<u32>(0u, 0x7ff80000u);
+    }
+    return cell;
+}
+
+// All that a cell covers; with their deviations from its mean. Excluded ones enter only where there are no others.
 fn all_of(z: u32, y: u32, x: u32, voxels: bool, mean: vec2<u32>, again: bool) -> Cell {
     var cells: array<Cell, 8>;
     var there: array<bool, 8>;
+    var any_needed = false;
     for (var i = 0u; i < 8u; i += 1u) {
         let at = vec3<u32>((i >> 1u) & 1u, i & 1u, i >> 2u);
         let inside = z + at.x < p.in_z && y + at.y < p.in_y && x + at.z < p.in_x;
         there[i] = inside && at.x < p.step_z && at.y < p.step_y && at.z < p.step_x;
         if there[i] {
             cells[i] = finer(z + at.x, y + at.y, x + at.z, voxels);
-            if again {
-                cells[i] = moved(cells[i], mean);
-            }
+            any_needed = any_needed || (cells[i].n & EXCLUDED) == 0u;
+        }
+    }
+    for (var i = 0u; i < 8u; i += 1u) {
+        if any_needed && (cells[i].n & EXCLUDED) != 0u {
+            cells[i] = left_out();
+        }
+        cells[i].n &= ~EXCLUDED;
+        if there[i] && again {
+            cells[i] = moved(cells[i], mean);
         }
     }
     var turn = IN_TURN;
@@ -140,6 +169,7 @@ fn all_of(z: u32, y: u32, x: u32, voxels: bool, mean: vec2<u32>, again: bool) ->
             cells[a] = plus(cells[a], cells[b]);
         }
     }
+    cells[0].n |= select(EXCLUDED, 0u, any_needed);
     return cells[0];
 }
 

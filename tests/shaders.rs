@@ -3,16 +3,38 @@
 use std::fs;
 use std::path::Path;
 
+use naga::Module;
+use naga::back::{hlsl, msl, spv};
 use naga::front::wgsl;
-use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use occlude::gpu::record::Shader;
+
+fn parsed(text: &str) -> Result<(Module, ModuleInfo), String> {
+    let module = wgsl::parse_str(text).map_err(|e| e.emit_to_string(text))?;
+    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+    let info = validator.validate(&module).map_err(|e| e.emit_to_string(text))?;
+    Ok((module, info))
+}
 
 /// What is wrong with a shader, and the names of its entry points.
 fn check(text: &str) -> Result<Vec<String>, String> {
-    let module = wgsl::parse_str(text).map_err(|e| e.emit_to_string(text))?;
-    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
-    validator.validate(&module).map_err(|e| e.emit_to_string(text))?;
-    Ok(module.entry_points.iter().map(|e| e.name.clone()).collect())
+    parsed(text).map(|(module, _)| module.entry_points.iter().map(|e| e.name.clone()).collect())
+}
+
+/// A shader in the languages of Vulkan (as words), Metal and Direct3D 12.
+fn translated(text: &str) -> Result<(Vec<u32>, String, String), String> {
+    let (module, info) = parsed(text)?;
+    let spv = spv::write_vec(&module, &info, &spv::Options::default(), None).map_err(|e| format!("SPIR-V: {e}"))?;
+    let (options, of_pipeline) = (msl::Options::default(), msl::PipelineOptions::default());
+    let (metal, entries) =
+        msl::write_string(&module, &info, &options, &of_pipeline).map_err(|e| format!("MSL: {e}"))?;
+    entries.entry_point_names.into_iter().collect::<Result<Vec<_>, _>>().map_err(|e| format!("MSL: {e}"))?;
+    let mut direct = String::new();
+    let (options, of_pipeline) = (hlsl::Options::default(), hlsl::PipelineOptions::default());
+    let mut writer = hlsl::Writer::new(&mut direct, &options, &of_pipeline);
+    let entries = writer.write(&module, &info, None).map_err(|e| format!("HLSL: {e}"))?;
+    entries.entry_point_names.into_iter().collect::<Result<Vec<_>, _>>().map_err(|e| format!("HLSL: {e}"))?;
+    Ok((spv, metal, direct))
 }
 
 #[test]
@@ -50,6 +72,39 @@ fn every_shader_is_valid() {
     }
     assert!(files.is_empty(), "no shader is made of {files:?}");
     assert!(failures.is_empty(), "{failures}");
+}
+
+/// The body of a function in a text with braces.
+fn body<'t>(text: &'t str, head: &str) -> Option<&'t str> {
+    text.split_once(head)?.1.split_once("{")?.1.split_once("}").map(|b| b.0)
+}
+
+#[test]
+fn every_shader_is_translated_for_vulkan_metal_and_direct3d() {
+    for shader in Shader::ALL {
+        let name = shader.name();
+        let (spv, metal, direct) = translated(shader.text()).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(spv[0], 0x0723_0203, "{name}: SPIR-V begins with its number");
+        for (language, text) in [("MSL", &metal), ("HLSL", &direct)] {
+            for entry in shader.entries() {
+                assert!(text.contains(&format!("void {entry}")), "{name}: {language} has no {entry}");
+            }
+            // No compiler may fuse what goes through integers, whatever its fast mathematics allow among floats: naga sets no
+            // flags, and Metal's are fast by default.
+            if shader.files().contains(&"floats") {
+                let alone = body(text, "float alone(").unwrap_or_else(|| panic!("{name}: {language} keeps `alone`"));
+                let hidden = [["as_type<uint>(v)", "as_type<float>("], ["asuint(v)", "asfloat("]];
+                let hidden = hidden.iter().any(|h| h.iter().all(|part| alone.contains(part)));
+                assert!(hidden && alone.contains(" ^ ") && alone.contains("zero"), "{name}, {language}: {alone}");
+            }
+            // Built-in functions that drivers approximate as they like.
+            for word in ["exp(", "exp2(", "log(", "log2(", "pow(", "fma(", "mad("] {
+                let own = |at: usize| text[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_');
+                let built_in = text.match_indices(word).find(|(at, _)| !own(*at));
+                assert_eq!(built_in, None, "{name}: {language} calls {word}");
+            }
+        }
+    }
 }
 
 #[test]

@@ -1,7 +1,8 @@
-//! Finds an adapter and opens it: Vulkan only, ranked by device type, software refused unless asked for by name.
+//! Finds an adapter and opens it: by the system's own way only, ranked by device type, software refused unless asked for by name.
 
 use std::sync::{Arc, Condvar, Mutex, OnceLock};
 
+use super::backend;
 use super::facts::{GpuFacts, GpuKind, SLOTS};
 use super::shaders::{MOST_BINDINGS, Shader};
 use super::slot::Slot;
@@ -41,11 +42,11 @@ fn rank(kind: wgpu::DeviceType) -> u32 {
 fn adapter(kind: GpuKind) -> Result<wgpu::Adapter, String> {
     // Flags are named rather than taken from the build type, and no variable of the environment changes the choice.
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
-        backends: wgpu::Backends::VULKAN,
+        backends: backend::BACKENDS,
         flags: wgpu::InstanceFlags::empty(),
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
-    let all = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
+    let all = pollster::block_on(instance.enumerate_adapters(backend::BACKENDS));
     let found: Vec<String> =
         all.iter().map(|a| a.get_info()).map(|i| format!("{} ({:?})", i.name, i.device_type)).collect();
     let fits = |a: &wgpu::Adapter| {
@@ -53,11 +54,12 @@ fn adapter(kind: GpuKind) -> Result<wgpu::Adapter, String> {
         software == (kind == GpuKind::Software)
     };
     all.into_iter().filter(fits).min_by_key(|a| rank(a.get_info().device_type)).ok_or_else(|| {
+        let name = backend::NAME;
         let wanted = match kind {
-            GpuKind::Hardware => "a Vulkan driver of a hardware GPU",
-            GpuKind::Software => "a Vulkan driver in software, such as lavapipe",
+            GpuKind::Hardware => format!("a {name} driver of a hardware GPU"),
+            GpuKind::Software => format!("a {name} driver in software, {}", backend::SOFTWARE),
         };
-        let found = if found.is_empty() { "no Vulkan adapter".to_string() } else { found.join(", ") };
+        let found = if found.is_empty() { format!("no {name} adapter") } else { found.join(", ") };
         format!("looked for {wanted}; found {found}")
     })
 }
@@ -99,6 +101,7 @@ pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
         software: info.device_type == wgpu::DeviceType::Cpu,
         most_bytes: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(1 << 30),
         exact_floats: false, // until the probe has said so
+        close_floats: false,
     };
     let tick = timed.then(|| queue.get_timestamp_period() as f64);
     let kernels = Shader::ALL.iter().map(|_| Default::default()).collect();

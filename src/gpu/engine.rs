@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
+use super::backend;
 use super::device::{self, Device, SlotGuard};
 use super::facts::{GpuFacts, GpuKind};
 use super::record::{Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Recording, STAMP_BYTES, groups};
@@ -56,7 +57,7 @@ pub type Fill<'a> = &'a mut dyn FnMut(&mut wgpu::WriteOnly<[u8]>) -> bool;
 pub type Finish<'a> = &'a mut dyn FnMut(Option<&[u8]>) -> Result<(), GpuError>;
 
 impl Gpu {
-    /// Opens the best Vulkan adapter of this kind; the error says what was looked for and found.
+    /// Opens the best adapter of this kind; the error says what was looked for and found.
     pub fn open(kind: GpuKind) -> Result<Gpu, String> {
         Gpu::open_with(kind, false)
     }
@@ -71,7 +72,10 @@ impl Gpu {
         let cap = facts.most_bytes;
         let mut gpu =
             Gpu { kind, facts, timed, cap, device: Mutex::new(Some(Arc::new(device))), gone: AtomicBool::new(false) };
-        gpu.facts.exact_floats = gpu.probe().map_err(|e| format!("{} does not compute: {e}", gpu.facts.name))?;
+        let name = gpu.facts.name.clone();
+        let failed = |e: GpuError| format!("{name} does not compute: {e}");
+        gpu.facts.exact_floats = gpu.probe().map_err(failed)?;
+        gpu.facts.close_floats = backend::BOUNDS_ERRORS || gpu.probe_close().map_err(failed)?;
         Ok(gpu)
     }
 

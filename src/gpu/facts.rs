@@ -22,6 +22,8 @@ pub struct GpuFacts {
     pub most_bytes: u64,
     /// f32 arithmetic is the CPU's, bit for bit, where shaders ask for it.
     pub exact_floats: bool,
+    /// Openness and gradients, of which f32 may differ in their last bits, lie within [`tolerance`].
+    pub close_floats: bool,
 }
 
 /// Why exact openness stays on the CPU.
@@ -74,6 +76,9 @@ pub fn window(dtype: DType, missing: bool, channels: &[WindowChannel]) -> Result
 
 /// Why float stages stay on the CPU where an adapter rounds otherwise.
 pub const INEXACT: &str = "the adapter rounds or fuses f32 operations unlike the CPU: runs on the CPU";
+
+/// Why openness and gradients stay on the CPU where an adapter is less exact than its kind.
+pub const ROUGH: &str = "openness or gradients of the adapter miss the tolerances: runs on the CPU";
 
 /// Whether a Gaussian of this type has a GPU kernel, or why not. It also asks for [`GpuFacts::exact_floats`].
 pub fn gaussian(dtype: DType, missing: bool) -> Result<(), &'static str> {

@@ -3,15 +3,18 @@
 //!
 //! All boxes are in voxels of the volume. A part's boxes go from the sinks backward: each step makes what its readers see.
 
+use super::extend::Beyond;
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
-use super::passes::{cut, stored};
+use super::masks::Mask;
+use super::passes::stored;
 use super::points::{LOOKED, Op};
-use super::record::{Bind, Buffer, Recording, Sizes};
+use super::record::{Bind, Buffer, Recording, Sizes, rounded};
 use super::recorder::Recorder;
 use super::slopes::Fit;
-use super::sweep::MOST_REPEATED;
+use super::sweep::repeated;
 use super::taps::Wanted;
+use super::unfit::{Unfit, cut_to};
 use crate::grid::{Affine, DType, Region};
 use crate::kernel::obscurance::ObscuranceParams;
 use crate::stage::{WindowChannel, WindowParams};
@@ -55,8 +58,10 @@ pub struct FlowStep {
     pub inputs: Vec<Input>,
     /// Voxels that a window sees on each side.
     pub reach: [usize; 3],
-    /// What the host's voxels beyond the volume are, where the source has any; else windows end there.
-    pub padded: bool,
+    /// What windows see beyond the volume. Gradients see the nearest voxels, whatever stands here.
+    pub beyond: Beyond,
+    /// Of a masked step, by channel: what stands where nothing is needed.
+    pub fills: Option<Vec<f32>>,
 }
 
 /// What becomes of a channel.
@@ -89,6 +94,8 @@ pub struct FlowPart {
     /// What the host packs, in rows of `pitch` voxels.
     pub source: Region,
     pub pitch: usize,
+    /// The masks behind it.
+    pub masks: Vec<Mask>,
     pub recording: Recording,
     /// By sink: the box that this part makes, and where it stands among what comes back.
     pub placed: Vec<Option<(Region, Placed)>>,
@@ -118,8 +125,7 @@ impl Flow {
         }
         for (s, step) in self.steps.iter().enumerate().rev() {
             let Some(region) = boxes[s] else { continue };
-            let seen = region.grow(step.reach);
-            let seen = if step.padded { seen } else { seen.clip(&self.volume) };
+            let seen = region.grow(step.reach).clip(&self.volume);
             step.inputs.iter().for_each(|&i| of(&mut boxes, i, seen));
         }
         source.map(|s| (s, boxes))
@@ -133,9 +139,12 @@ impl Flow {
         Some((hull, unit, pyramids().next().map_or(hull.lo, |(s, _)| s.region.lo)))
     }
 
-    /// Parts of which every buffer is at most `cap` bytes; `None` where there are none, or too many buffers are needed.
-    pub fn parts(&self, cap: u64) -> Option<Vec<FlowPart>> {
-        let (hull, unit, origin) = self.hull()?;
+    /// Parts of which every buffer is at most `cap` bytes.
+    ///
+    /// # Errors
+    /// There are none, or too many buffers are needed.
+    pub fn parts(&self, cap: u64) -> Result<Vec<FlowPart>, Unfit> {
+        let (hull, unit, origin) = self.hull().ok_or(Unfit::Kernel)?;
         let cells = hull.cells(origin, unit);
         let region = |lo: [usize; 3], shape: [usize; 3]| {
             let at = |a: usize, i: usize| origin[a] + (cells.lo[a] + i as i64) * unit[a] as i64;
@@ -144,16 +153,16 @@ impl Flow {
             lo_hi.clip(&hull)
         };
         // Each box is recorded once more when it is known to fit: recording takes microseconds.
-        let boxes = cut(cells.shape(), |lo, shape| {
-            self.part(&region(lo, shape), cap).is_none_or(|p| p.recording.sizes.largest() <= cap)
+        let boxes = cut_to(cells.shape(), cap, |lo, shape| {
+            Ok(self.part(&region(lo, shape), cap)?.map_or(Sizes::default(), |p| p.recording.sizes))
         })?;
-        let parts: Vec<FlowPart> =
-            boxes.into_iter().map(|(lo, shape)| self.part(&region(lo, shape), cap)).collect::<Option<_>>()?;
+        let made = boxes.into_iter().map(|(lo, shape)| self.part(&region(lo, shape), cap));
+        let parts: Vec<FlowPart> = made.filter_map(Result::transpose).collect::<Result<_, _>>()?;
         // A sweep's halo is large.
-        let sweeps = self.steps.iter().any(|s| matches!(s.kernel, Kernel::Sweep(_)));
-        let read: usize = parts.iter().map(|p| p.source.voxels()).sum();
-        let once = self.source()?.voxels();
-        (!sweeps || parts.len() == 1 || read <= MOST_REPEATED * once).then_some(parts)
+        if self.steps.iter().any(|s| matches!(s.kernel, Kernel::Sweep(_))) {
+            repeated(parts.iter().map(|p| p.source.voxels()), self.source().map_or(0, |s| s.voxels()))?;
+        }
+        Ok(parts)
     }
 
     /// Largest buffers of any part.
@@ -162,17 +171,27 @@ impl Flow {
         parts.iter().map(|p| p.recording.sizes).fold(Sizes::default(), Sizes::max)
     }
 
-    /// Records what of the flow lies in a box. `None` where that takes too many buffers.
-    fn part(&self, region: &Region, cap: u64) -> Option<FlowPart> {
+    /// Records what of the flow lies in a box; `None` where nothing does.
+    fn part(&self, region: &Region, cap: u64) -> Result<Option<FlowPart>, Unfit> {
         let own = |sink: &Sink| Some(sink.region.clip(region)).filter(|r| !r.is_empty());
-        let (source, boxes) = self.boxes(own)?;
-        let kind = stored(self.dtype)?;
+        let Some((source, boxes)) = self.boxes(own) else { return Ok(None) };
+        let kind = stored(self.dtype).ok_or(Unfit::Kernel)?;
         let pitch = source.shape()[2].next_multiple_of(4 / kind.voxel);
-        let bytes = source.shape()[0] * source.shape()[1] * pitch * kind.voxel;
-        let mut to = Recorder::new(bytes as u64);
+        let mut bytes = rounded((source.shape()[0] * source.shape()[1] * pitch * kind.voxel) as u64);
+        let mut masks = Vec::new();
+        for (step, region) in boxes.iter().enumerate().filter(|(s, _)| self.steps[*s].fills.is_some()) {
+            let Some(region) = *region else { continue };
+            masks.push(Mask { step, region, from: bytes });
+            bytes += masks[masks.len() - 1].bytes();
+        }
+        let mut to = Recorder::new(bytes);
         let slab = Slab { bind: Buffer::Source.into(), region: source, pitch };
-        let mut state =
-            State { flow: self, source: Made { slabs: vec![slab], stored: kind, affine: self.affine }, made: vec![] };
+        let mut state = State {
+            flow: self,
+            masks: &masks,
+            source: Made { slabs: vec![slab], stored: kind, affine: self.affine },
+            made: vec![],
+        };
         let mut placed = vec![None; self.sinks.len()];
         let mut flag = None;
         for (s, step) in self.steps.iter().enumerate() {
@@ -180,6 +199,9 @@ impl Flow {
                 Some(region) => step.record(&state, region, cap, &mut flag, &mut to)?,
                 None => Made::nothing(),
             };
+            if let (Some(mask), Some(fills)) = (state.mask(s), &step.fills) {
+                made.slabs.iter().zip(fills).for_each(|(slab, fill)| mask.fill(slab.bind, *fill, &mut to));
+            }
             state.made.push(made);
             for (sink, placed) in self.sinks.iter().zip(&mut placed).filter(|(sink, _)| sink.ready() == Some(s)) {
                 *placed = own(sink).map(|region| (region, state.deliver(sink, &region, &mut to)));
@@ -187,7 +209,7 @@ impl Flow {
             state.release(s, &mut to);
         }
         let flag = flag.map(|f: Buffer| to.read(Bind::from(f), LOOKED));
-        Some(FlowPart { source, pitch, recording: to.finish()?, placed, flag })
+        Ok(Some(FlowPart { source, pitch, masks, recording: to.finish()?, placed, flag }))
     }
 }
 
@@ -210,6 +232,7 @@ impl Input {
 /// What is on the device while a part is recorded.
 pub(super) struct State<'a> {
     flow: &'a Flow,
+    masks: &'a [Mask],
     source: Made,
     made: Vec<Made>,
 }
@@ -223,12 +246,24 @@ impl State<'_> {
         }
     }
 
+    pub fn volume(&self) -> &Region {
+        &self.flow.volume
+    }
+
+    /// The mask of a step.
+    fn mask(&self, step: usize) -> Option<&Mask> {
+        self.masks.iter().find(|m| m.step == step)
+    }
+
     fn deliver(&self, sink: &Sink, region: &Region, to: &mut Recorder) -> Placed {
         let value = self.read(sink.value).slab;
         let mean = sink.mean.map(|m| self.read(m).slab);
         match &sink.pyramid {
-            Some(pyramid) => pyramid.record(&value, mean.as_ref(), region, to),
-            None => Pyramid::plain().record(&value, None, region, to),
+            Some(pyramid) => {
+                let mask = sink.value.step().and_then(|s| self.mask(s));
+                pyramid.record(&value, mean.as_ref(), mask, region, to)
+            }
+            None => Pyramid::plain().record(&value, None, None, region, to),
         }
     }
 

@@ -2,10 +2,10 @@
 
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::flow::{Flow, FlowPart, Sink};
-use super::levels::{Placed, Pyramid};
+use super::levels::{EXCLUDED, Placed, Pyramid};
 use super::passes::{Part, stored};
 use super::windows::{cast, pack};
-use crate::grid::{AnyView, AnyViewMut, Region, Shape, Voxel};
+use crate::grid::{AnyView, AnyViewMut, Region, Shape, View, Voxel};
 
 /// Where a sink's results go.
 pub enum SinkOut<'a> {
@@ -16,9 +16,20 @@ pub enum SinkOut<'a> {
     Levels(Vec<AnyViewMut<'a>>, &'a mut Vec<f64>),
 }
 
+/// Which voxels of a masked step's outputs are needed: 1 where one is.
+#[derive(Clone, Copy)]
+pub struct Needed<'a> {
+    /// Which of the flow's steps.
+    pub step: usize,
+    pub view: View<'a, u8>,
+    /// What the view covers: at least all that the step makes.
+    pub region: Region,
+}
+
 impl Gpu {
     /// Makes all sinks of a flow: what the steps would make one by one ([`Gpu::window`] and its kind, the kernels of the CPU
-    /// for levels and voxel by voxel), bit for bit. `src` covers `src_box`, which holds [`Flow::source`]. `None` where they
+    /// for levels and voxel by voxel), bit for bit. `src` covers `src_box`, which holds [`Flow::source`]; `needed` has a mask for
+    /// every step with fills. `None` where they
     /// must be called one by one, because a window is left to the CPU or the device cannot hold all; the outputs may then
     /// hold anything. After a failure the device is opened anew and the call tried once more.
     ///
@@ -29,10 +40,11 @@ impl Gpu {
         flow: &Flow,
         src: AnyView,
         src_box: Region,
+        needed: &[Needed],
         outs: &mut [SinkOut],
     ) -> Result<Option<Times>, GpuError> {
         assert_eq!(outs.len(), flow.sinks.len(), "an output for each sink");
-        let Some(parts) = flow.parts(self.cap()) else { return Ok(None) };
+        let Ok(parts) = flow.parts(self.cap()) else { return Ok(None) };
         let voxel = stored(flow.dtype).map_or(0, |s| s.voxel);
         room(flow, outs);
         self.attempt(|device| {
@@ -40,7 +52,10 @@ impl Gpu {
             for part in &parts {
                 let shape = part.source.shape();
                 let seen = Part { lo: [0; 3], dst: shape, from: src_box.offset_of(&part.source), src: shape };
-                let mut fill = |to: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, part.pitch * voxel, to);
+                let mut fill = |to: &mut wgpu::WriteOnly<[u8]>| {
+                    pack_masks(part, needed, to);
+                    pack(src, &seen, part.pitch * voxel, to)
+                };
                 let mut left = false;
                 let mut done = |bytes: Option<&[u8]>| {
                     let bytes = bytes.unwrap_or_default();
@@ -54,6 +69,17 @@ impl Gpu {
             }
             Ok(Some(times))
         })
+    }
+}
+
+/// The masks of a part to their places.
+fn pack_masks(part: &FlowPart, needed: &[Needed], to: &mut wgpu::WriteOnly<[u8]>) {
+    for mask in &part.masks {
+        let given = needed.iter().find(|n| n.step == mask.step).expect("a mask for every step with fills");
+        let shape = mask.region.shape();
+        let seen = Part { lo: [0; 3], dst: shape, from: given.region.offset_of(&mask.region), src: shape };
+        let from = mask.from as usize;
+        pack(AnyView::U8(given.view), &seen, mask.pitch(), &mut to.slice(from..from + mask.bytes() as usize));
     }
 }
 
@@ -143,7 +169,9 @@ fn numbers(
         let [z, y, x] = [i / (ny * nx) + at[0], i / nx % ny + at[1], i % nx + at[2]];
         let to = (z * brick[1] + y) * brick[2] + x;
         out[to] = pair(c, 0);
-        out[count + to] = c[2] as f64;
+        // The sign says that the cell covers excluded voxels only.
+        let covered = (c[2] & !EXCLUDED) as f64;
+        out[count + to] = if c[2] & EXCLUDED != 0 { -covered } else { covered };
         if cell > 3 {
             out[2 * count + to] = pair(c, 3);
             out[3 * count + to] = pair(c, 5);

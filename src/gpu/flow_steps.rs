@@ -9,6 +9,7 @@ use super::recorder::{Planes, Recorder};
 use super::slopes::{Fit, Input, SlopesJob};
 use super::sweep::{Keys, SweepJob, SweepPart};
 use super::taps::{TapsJob, Wanted};
+use super::unfit::Unfit;
 use crate::grid::{Affine, DType, Region};
 use crate::kernel::obscurance::{ObscuranceParams, Prepared};
 use crate::kernel::window::Needs;
@@ -66,8 +67,10 @@ impl Window {
 }
 
 impl FlowStep {
-    /// Makes the step's channels over a box. Where a window may be left to the CPU, `flag` says so. `None` where there is no
-    /// kernel for what it reads.
+    /// Makes the step's channels over a box. Where a window may be left to the CPU, `flag` says so.
+    ///
+    /// # Errors
+    /// There is no kernel for what it reads, or not within `cap` bytes.
     pub(super) fn record(
         &self,
         state: &State,
@@ -75,14 +78,18 @@ impl FlowStep {
         cap: u64,
         flag: &mut Option<Buffer>,
         to: &mut Recorder,
-    ) -> Option<Made> {
+    ) -> Result<Made, Unfit> {
         let reads: Vec<Read> = self.inputs.iter().map(|i| state.read(*i)).collect();
-        let read = *reads.first()?;
+        let read = *reads.first().ok_or(Unfit::Kernel)?;
+        let extended = self.extended(&read, region, state.volume(), to);
+        let read = extended.unwrap_or(read);
         let window = Window { read, dtype: read.stored.dtype(), region: *region };
-        match &self.kernel {
-            Kernel::Gaussian { sigma, wanted } => window.gaussian(*sigma, *wanted, to),
-            Kernel::Gradient { fit, magnitude, vector } => window.gradient(fit, [*magnitude, *vector], flag, to),
-            Kernel::Windows { params, channels } => window.windows(params, channels, flag, to),
+        let made = match &self.kernel {
+            Kernel::Gaussian { sigma, wanted } => window.gaussian(*sigma, *wanted, to).ok_or(Unfit::Kernel),
+            Kernel::Gradient { fit, magnitude, vector } => {
+                window.gradient(fit, [*magnitude, *vector], flag, to).ok_or(Unfit::Kernel)
+            }
+            Kernel::Windows { params, channels } => window.windows(params, channels, flag, to).ok_or(Unfit::Kernel),
             Kernel::Sweep(params) => window.sweep(params, cap, to),
             Kernel::Points(ops) => {
                 let planes = Planes::take(to, region.voxels(), ops.len());
@@ -90,8 +97,20 @@ impl FlowStep {
                     let reads: Vec<Read> = of.iter().map(|&i| reads[i]).collect();
                     op.record(&reads, region, planes.plane(c), to);
                 }
-                Some(Made::planes(&planes, ops.len(), region))
+                Ok(Made::planes(&planes, ops.len(), region))
             }
+        };
+        extended.iter().for_each(|r| to.give(r.slab.bind.buffer));
+        made
+    }
+
+    /// What windows with a border rule read.
+    fn extended(&self, read: &Read, region: &Region, volume: &Region, to: &mut Recorder) -> Option<Read> {
+        match self.kernel {
+            Kernel::Windows { .. } | Kernel::Gaussian { .. } => {
+                self.beyond.record(read, &region.grow(self.reach), volume, to)
+            }
+            _ => None,
         }
     }
 }
@@ -148,9 +167,9 @@ impl Window {
         Some(Made::planes(&planes, count, &self.region))
     }
 
-    fn sweep(&self, params: &ObscuranceParams, cap: u64, to: &mut Recorder) -> Option<Made> {
+    fn sweep(&self, params: &ObscuranceParams, cap: u64, to: &mut Recorder) -> Result<Made, Unfit> {
         let (prepared, from) = (Prepared::new(params), self.read.slab);
-        let job = SweepJob::new(&prepared, self.dtype, from.region, self.region)?;
+        let job = SweepJob::new(&prepared, self.dtype, from.region, self.region).ok_or(Unfit::Kernel)?;
         let [nz, ny, _] = from.region.shape();
         let words = (nz * ny * from.pitch * self.read.stored.voxel).div_ceil(4);
         let codes = to.take(words as u64 * 4);
@@ -167,7 +186,7 @@ impl Window {
         reads.extend(self.read.stored.real.then_some(Read { affine: Affine::IDENTITY, ..self.read }));
         Op::Share { of: prepared.total() }.record(&reads, &self.region, planes.plane(0), to);
         to.give(sums);
-        Some(Made::planes(&planes, 1, &self.region))
+        Ok(Made::planes(&planes, 1, &self.region))
     }
 
     fn windows(

@@ -1,6 +1,7 @@
 //! Pyramids of a channel on the device: level 0 and every level that a brick makes, in the output's type, and the cells of the
 //! last one. Everything is in the CPU's bits, so it does not matter where a brick's levels are made.
 
+use super::masks::Mask;
 use super::record::{Bind, Buffer, Shader};
 use super::recorder::Recorder;
 use crate::grid::{Affine, DType, Region, Shape};
@@ -36,7 +37,7 @@ pub struct Join {
     pub mean: [u32; 3],
     pub kind: u32,
     pub threads: u32,
-    pub spare: [u32; 3],
+    pub mask: [u32; 3],
 }
 
 /// How voxels or cells become codes; `struct Write` of `shaders/level_write.wgsl`, which explains the fields.
@@ -55,6 +56,9 @@ pub struct Write {
     /// half, lo, width, top, low, high, slope, intercept.
     pub numbers: [[u32; 2]; 8],
 }
+
+/// Set in a cell's count where it covers only voxels that a mask excludes; in `shaders/level_cells.wgsl`, too.
+pub(super) const EXCLUDED: u32 = 1 << 31;
 
 /// The words of an f64, the low one first.
 pub fn words(v: f64) -> [u32; 2] {
@@ -122,8 +126,15 @@ impl Pyramid {
         if self.reduce == Reduce::Moments { 7 } else { 3 }
     }
 
-    /// Makes every level over a box of the channel. `mean` is the channel beside it, for moments.
-    pub fn record(&self, value: &Slab, mean: Option<&Slab>, region: &Region, to: &mut Recorder) -> Placed {
+    /// Makes every level over a box of the channel. `mean` is the channel beside it, for moments; `mask` says which voxels enter.
+    pub(super) fn record(
+        &self,
+        value: &Slab,
+        mean: Option<&Slab>,
+        mask: Option<&Mask>,
+        region: &Region,
+        to: &mut Recorder,
+    ) -> Placed {
         let mut placed = Placed::default();
         let shape = region.shape();
         let whole = value.region == *region && value.pitch == shape[2] && self.dtype == DType::F32;
@@ -145,10 +156,10 @@ impl Pyramid {
                 mean: mean.map_or([0; 3], |m| m.start(region)),
                 kind: self.kind(),
                 threads: count as u32,
-                spare: [0; 3],
+                mask: mask.filter(|_| fine.is_none()).map_or([0; 3], |m| m.start(region)),
             };
             let input = fine.map_or(value.bind, Bind::from);
-            let bind = [input, cells.into(), mean.map_or(input, |m| m.bind)];
+            let bind = [input, cells.into(), mean.map_or(input, |m| m.bind), mask.map_or(input, |m| m.bind())];
             to.dispatch(Shader::LevelPool, fine.is_some() as usize, &join, &bind, join.threads);
             fine.into_iter().for_each(|f: Buffer| to.give(f));
             placed.levels.push((self.codes().write(cells.into(), dense(next), next, true, to), next));

@@ -130,18 +130,11 @@ impl MapJob {
         read.shape()[2].next_multiple_of(4 / self.voxel)
     }
 
-    /// Where the cells of level `k`, from 1 on, stand among the results of a part.
-    pub fn place(&self, boxes: &[Region], k: usize) -> std::ops::Range<usize> {
-        let bytes = |b: &Region| b.voxels() * 4 * CELL;
-        let start = boxes[1..k].iter().map(|b| bytes(b).next_multiple_of(256)).sum();
-        start..start + bytes(&boxes[k])
-    }
-
     fn sizes(&self, part: Region) -> Sizes {
         // With the most that an output takes.
         let (dtype, mapping, affine) = (DType::F32, Mapping::KEEP, Affine::IDENTITY);
         let codes = MapCodes { first: 0, moments: vec![0, 1], dtype, mapping, affine, cells: true };
-        self.record(part).sizes.max(self.recorded(part, Some(&codes)).0.sizes)
+        self.recorded(part, &codes).0.sizes
     }
 
     /// Largest buffers of any part.
@@ -149,14 +142,10 @@ impl MapJob {
         largest(self.parts(brick, cap), |p| self.sizes(*p))
     }
 
-    /// Every level of a part, axis by axis, each read back when it is made: its cells, or with `codes` those that the part
-    /// owns in an output's type, one component after the other, and the cells of the last one.
-    pub fn record(&self, part: Region) -> Recording {
-        self.recorded(part, None).0
-    }
-
-    /// As [`Self::record`], and where the codes of every level from 1 on and the last one's cells stand.
-    pub(super) fn recorded(&self, part: Region, codes: Option<&MapCodes>) -> (Recording, Vec<Vec<u64>>, u64) {
+    /// Every level of a part, axis by axis, each read back when it is made: the cells that the part owns in an output's type, one
+    /// component after the other, and the cells of the last one as they are; with where the codes of every level from 1 on and
+    /// those cells stand.
+    pub fn recorded(&self, part: Region, codes: &MapCodes) -> (Recording, Vec<Vec<u64>>, u64) {
         let boxes = self.boxes(part);
         let pitch = self.pitch(boxes[0]);
         let source = boxes[0].shape()[0] * boxes[0].shape()[1] * pitch * self.voxel;
@@ -172,13 +161,12 @@ impl MapJob {
                 from = next;
             }
             let own = self.own(k, part);
-            let stored: Option<Vec<Codes>> =
-                codes.map(|c| c.moments.iter().filter(|_| k >= c.first).map(|m| c.of(*m)).collect());
+            let stored: Vec<Codes> = codes.moments.iter().filter(|_| k >= codes.first).map(|m| codes.of(*m)).collect();
             let slab = Slab { bind: from.buffer.into(), region: boxes[k], pitch: boxes[k].shape()[2] };
             let one = |c: Codes| c.write(slab.bind, slab.start(&own), own.shape(), true, &mut recorder);
-            places.push(stored.unwrap_or_default().into_iter().map(one).collect());
-            if codes.is_none_or(|c| c.cells && k + 1 == boxes.len()) {
-                last = recorder.read(from.buffer.into(), self.place(&boxes, k).len() as u64);
+            places.push(stored.into_iter().map(one).collect());
+            if codes.cells && k + 1 == boxes.len() {
+                last = recorder.read(from.buffer.into(), (boxes[k].voxels() * 4 * CELL) as u64);
             }
         }
         (recorder.finish().expect("a map takes few buffers"), places, last)
@@ -243,6 +231,8 @@ mod tests {
     #[test]
     fn recordings_are_sound_and_parts_tile_every_level() {
         let shape = [37, 60, 71];
+        let (dtype, mapping, affine) = (DType::U8, Mapping { range: Some([0.0, 9.0]), fill: 0.0 }, Affine::IDENTITY);
+        let codes = MapCodes { first: 0, moments: vec![0, 1], dtype, mapping, affine, cells: true };
         for dtype in [DType::U8, DType::I16] {
             let job = MapJob::new(dtype, levels(shape)).unwrap();
             for brick in [Region::whole(shape), Region::new([16, 0, 32], [37, 32, 71])] {
@@ -254,12 +244,14 @@ mod tests {
                         assert_eq!(cells, job.own(k, brick).voxels());
                     }
                     for part in &parts {
-                        let recording = job.record(*part);
+                        let (recording, places, _) = job.recorded(*part, &codes);
+                        assert!(places.len() == 3 && places.iter().all(|p| p.len() == 2));
                         assert_eq!(recording.fault(), None);
                         assert!(recording.sizes.largest() <= cap);
                         let boxes = job.boxes(*part);
                         assert!((1..4).all(|k| boxes[k].contains(&job.own(k, *part))));
-                        assert_eq!(recording.dispatches().count(), 3 + 2 + 3);
+                        // An axis at a time, then both moments of every level as codes.
+                        assert_eq!(recording.dispatches().count(), 3 + 2 + 3 + 3 * 2);
                     }
                 }
             }

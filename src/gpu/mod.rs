@@ -10,17 +10,22 @@
 //! | `passes`, `sweep`, `taps`, `slopes` | windows, obscurance, Gaussians and gradients recorded, cut into parts that fit |
 //! | `pairs`, `probe` | f32 arithmetic as the shaders ask for it, and whether a device does it so |
 //! | `maps`, `occlusion` | occlusion maps recorded, and called |
+//! | `masks`, `extend` | voxels that nobody needs, what lies beyond the volume |
 //! | `finish`, `points`, `levels` | results of windows, steps that look at one voxel, pyramids, recorded |
 //! | `flow`, `flow_steps`, `flow_call` | several steps and their levels recorded together, and called |
+//! | `unfit` | why work is not the device's |
 //! | `nodes` | whether a machine can have a GPU at all |
+//! | `backend` | Vulkan, Metal or Direct3D 12 |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
 //! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
 //!
-//! Everything above `device` knows no wgpu.
+//! Everything above `backend` knows no wgpu.
 
+mod backend;
 pub mod device;
 pub mod engine;
+pub mod extend;
 pub mod facts;
 pub mod finish;
 mod float_windows;
@@ -31,6 +36,7 @@ mod gaussian;
 mod gradient;
 pub mod levels;
 pub mod maps;
+mod masks;
 mod nodes;
 mod obscurance;
 mod occlusion;
@@ -45,12 +51,14 @@ pub mod slopes;
 mod slot;
 pub mod sweep;
 pub mod taps;
+mod unfit;
 mod windows;
 
 pub use engine::{Gpu, GpuError, Times};
 pub use facts::{GpuFacts, GpuKind};
-pub use flow_call::SinkOut;
+pub use flow_call::{Needed, SinkOut};
 pub use occlusion::MapLevels;
+pub use unfit::Unfit;
 
 use crate::config::Device;
 

@@ -32,7 +32,7 @@ impl Gpu {
             return Ok(Times::default());
         }
         let job = SweepJob::new(sweep, src.dtype(), src_box, dst_box);
-        let Some((job, parts)) = job.and_then(|j| j.parts(self.cap()).map(|p| (j, p))) else {
+        let Some((job, parts)) = job.and_then(|j| j.parts(self.cap()).ok().map(|p| (j, p))) else {
             let openness = Some(AnyViewMut::F32(openness.reborrow()));
             sweep.sweep(
                 src,

@@ -10,45 +10,6 @@ use crate::brick::Voxels;
 use crate::grid::{Affine, AnyView, Region};
 use crate::kernel::occlusion_map::Moments;
 
-impl Gpu {
-    /// The levels from 1 on of an occlusion map over a brick, scaled by `affine`: each over the cells that the brick owns, as
-    /// by [`crate::kernel::occlusion_map::coarsen`] within [`facts::tolerance`]. `src` covers `src_box`, which holds what
-    /// [`MapJob::boxes`] of the brick reads; all boxes are counted from the start of the map. After a failure the device is
-    /// opened anew and the call tried once more.
-    ///
-    /// # Errors
-    /// An input without a kernel, a cell that does not fit the device, or a second failure of the device.
-    pub fn occlusion_levels(
-        &self,
-        src: AnyView,
-        src_box: Region,
-        job: &MapJob,
-        brick: Region,
-        affine: Affine,
-    ) -> Result<(Vec<Moments>, Times), GpuError> {
-        facts::occlusion_map(src.dtype(), false).map_err(|e| GpuError(e.into()))?;
-        let parts = job.parts(brick, self.cap()).ok_or_else(|| GpuError("a cell does not fit its buffers".into()))?;
-        self.attempt(|device| {
-            let mut times = Times::default();
-            let mut levels: Vec<Moments> = (1..job.levels()).map(|k| room(job.own(k, brick).voxels())).collect();
-            for &part in &parts {
-                let boxes = job.boxes(part);
-                let (seen, pitch) = read(job, boxes[0], src_box);
-                let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, pitch, out);
-                let mut done = |bytes: Option<&[u8]>| {
-                    for (k, to) in (1..).zip(&mut levels) {
-                        let cells = cast(&bytes.unwrap_or_default()[job.place(&boxes, k)])?;
-                        paste(cells, boxes[k], job.own(k, part), job.own(k, brick), affine, to);
-                    }
-                    Ok(())
-                };
-                run_part(device, &job.record(part), &mut fill, &mut done, &mut times)?;
-            }
-            Ok((levels, times))
-        })
-    }
-}
-
 /// The levels of a map that a brick owns, as an output stores them.
 #[derive(Debug)]
 pub struct MapLevels {
@@ -59,11 +20,14 @@ pub struct MapLevels {
 }
 
 impl Gpu {
-    /// As [`Gpu::occlusion_levels`], in an output's type: what [`crate::kernel::convert::convert`] makes of those levels, bit
-    /// for bit.
+    /// The levels from 1 on of an occlusion map over a brick, each over the cells that the brick owns, in an output's type: what
+    /// [`crate::kernel::convert::convert`] makes, bit for bit, of levels that are those of
+    /// [`crate::kernel::occlusion_map::coarsen`] within [`facts::tolerance`]. `src` covers `src_box`, which holds what
+    /// [`MapJob::boxes`] of the brick reads; all boxes are counted from the start of the map. After a failure the device is
+    /// opened anew and the call tried once more.
     ///
     /// # Errors
-    /// As there.
+    /// An input without a kernel, a cell that does not fit the device, or a second failure of the device.
     pub fn occlusion_codes(
         &self,
         src: AnyView,
@@ -88,7 +52,7 @@ impl Gpu {
                 let boxes = job.boxes(part);
                 let (seen, pitch) = read(job, boxes[0], src_box);
                 let mut fill = |out: &mut wgpu::WriteOnly<[u8]>| pack(src, &seen, pitch, out);
-                let (recording, places, last) = job.recorded(part, Some(codes));
+                let (recording, places, last) = job.recorded(part, codes);
                 let mut done = |bytes: Option<&[u8]>| {
                     let bytes = bytes.unwrap_or_default();
                     for (k, (places, levels)) in (1..).zip(places.iter().zip(&mut made.codes)) {

@@ -1,19 +1,79 @@
 //! Holds a device to the f32 arithmetic that the shaders ask for, before anything is placed on it that needs it.
 
 use super::engine::{Gpu, GpuError, Times, run_part};
+use super::facts::tolerance;
 use super::pairs::{self, Arithmetic, Cell};
 use super::passes::{self, Quantity, result_bytes};
+use super::slopes::Fit;
 use super::windows::{cast, pack};
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{Affine, AnyView, DType, Shape, View};
+use crate::kernel::gradient::{self, GradientOut};
 use crate::kernel::simd::Level;
+use crate::kernel::window::{self, Place, WindowOut};
 use crate::kernel::{Context, gaussian};
+use crate::stage::{GradientWeight, Method, Ties, WindowChannel, WindowParams};
 
 impl Gpu {
     /// Whether f32 operations that shaders keep apart are rounded one by one, in their order: a Gaussian and moments of
     /// windows, on voxels on which a fused or reordered sum shows, against the same operations here.
     pub(super) fn probe(&self) -> Result<bool, GpuError> {
         Ok(self.probe_gaussian()? && self.probe_moments()?)
+    }
+
+    /// Whether floats that need not be the CPU's to the bit lie within their tolerances: openness of integers (and of f32, where
+    /// windows of f32 run here) and gradients. Divisions, roots and what a compiler makes of polynomials are the driver's;
+    /// Vulkan bounds their errors ([`super::backend::BOUNDS_ERRORS`]), so that there only tests ask.
+    #[doc(hidden)]
+    pub fn probe_close(&self) -> Result<bool, GpuError> {
+        let integers = volume();
+        let mut close = self.probe_openness(&integers)? && self.probe_gradient(&integers)?;
+        if self.facts().exact_floats {
+            let floats = Voxels::F32((0..integers.len()).map(|i| integers.at(i) as f32 / 7.0).collect());
+            close = close && self.probe_openness(&floats)?;
+        }
+        Ok(close)
+    }
+
+    fn probe_openness(&self, volume: &Voxels) -> Result<bool, GpuError> {
+        let methods = [Method::CdfPower, Method::GaussianCdf, Method::Chebyshev, Method::ChebyshevLiteral];
+        let params = WindowParams { radius: [1, 2, 4], affine: Affine::IDENTITY, missing: None, solid_low: false };
+        let mut scratch = Scratch::new();
+        let mut made = [0, 1].map(|_| methods.map(|_| Voxels::zeroed(DType::F32, volume.len())));
+        for (k, made) in made.iter_mut().enumerate() {
+            let outs = made.iter_mut().zip(methods);
+            let mut outs: Vec<WindowOut> = outs
+                .map(|(v, m)| WindowOut { channel: WindowChannel::Openness(m, Ties::Le), dst: v.view_mut(EXTENT) })
+                .collect();
+            let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+            match k {
+                0 => window::window(volume.view(EXTENT), &params, Place::whole([0; 3]), &mut outs, &mut cx),
+                _ => self.window(volume.view(EXTENT), &params, [0; 3], [0; 3], &mut outs, &mut cx).map(|_| ())?,
+            }
+        }
+        let [cpu, gpu] = made;
+        Ok(cpu.iter().zip(&gpu).all(|(a, b)| within(a, b, tolerance::OPENNESS)))
+    }
+
+    fn probe_gradient(&self, volume: &Voxels) -> Result<bool, GpuError> {
+        let fit = Fit { size: 5, weight: GradientWeight::Distance, spacing: [1.0; 3], missing: None };
+        let dst: Shape = EXTENT.map(|n| n - 4);
+        let mut scratch = Scratch::new();
+        let mut made = [0, 1].map(|_| [0; 4].map(|_| Voxels::zeroed(DType::F32, dst.iter().product())));
+        for (k, [m, z, y, x]) in made.iter_mut().enumerate() {
+            let out =
+                GradientOut { magnitude: Some(m.view_mut(dst)), vector: Some([z, y, x].map(|v| v.view_mut(dst))) };
+            let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+            let (src, at) = (volume.view(EXTENT), [2; 3]);
+            match k {
+                0 => {
+                    gradient::gradient(src, fit.size, fit.weight, fit.spacing, Affine::IDENTITY, None, at, out, &mut cx)
+                }
+                _ => self.gradient(src, &fit, Affine::IDENTITY, at, out, &mut cx).map(|_| ())?,
+            }
+        }
+        let [cpu, gpu] = made;
+        Ok(cpu.iter().zip(&gpu).all(|(a, b)| within(a, b, tolerance::GRADIENT * 65536.0)))
     }
 
     fn probe_gaussian(&self) -> Result<bool, GpuError> {
@@ -50,6 +110,11 @@ impl Gpu {
     }
 }
 
+/// Whether no voxel is further from its twin; NaN is far from everything.
+fn within(a: &Voxels, b: &Voxels, bound: f64) -> bool {
+    a.len() == b.len() && (0..a.len()).all(|i| (a.at(i) - b.at(i)).abs() <= bound)
+}
+
 /// Extent and sigma of the Gaussian.
 const EXTENT: Shape = [5, 8, 64];
 const SIGMA: [f64; 3] = [0.8, 1.3, 2.4];
@@ -82,6 +147,14 @@ mod tests {
             })
         };
         (0..n).map(one).collect()
+    }
+
+    #[test]
+    fn the_bound_is_one_and_nan_is_not_close() {
+        let of = |v: f32| Voxels::F32(vec![0.5, v]);
+        assert!(within(&of(0.25), &of(0.25), 0.0) && within(&of(0.25), &of(0.375), 0.125));
+        assert!(!within(&of(0.25), &of(0.376), 0.125) && !within(&of(0.25), &of(f32::NAN), 0.125));
+        assert!(!within(&of(0.25), &Voxels::F32(vec![0.5]), 0.125));
     }
 
     #[test]

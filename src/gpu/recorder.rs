@@ -4,31 +4,33 @@
 use super::record::{
     Bind, Buffer, Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, WORK, rounded,
 };
+use super::unfit::Unfit;
 
 /// A recording in the making.
 #[derive(Debug)]
 pub struct Recorder {
     recording: Recording,
-    busy: [bool; WORK],
-    /// More buffers were asked for than there are.
-    beyond: bool,
+    /// By number; those beyond what a recording may have are only counted.
+    busy: Vec<bool>,
 }
 
 impl Recorder {
     /// `source`: bytes of packed voxels that the host writes.
     pub fn new(source: u64) -> Recorder {
         let sizes = Sizes { source: rounded(source), ..Sizes::default() };
-        Recorder { recording: Recording { sizes, ..Recording::default() }, busy: [false; WORK], beyond: false }
+        Recorder { recording: Recording { sizes, ..Recording::default() }, busy: Vec::new() }
     }
 
     /// A buffer of at least so many bytes.
     pub fn take(&mut self, bytes: u64) -> Buffer {
-        let free = self.busy.iter().position(|b| !b);
-        self.beyond |= free.is_none();
-        let i = free.unwrap_or(WORK - 1);
+        let i = self.busy.iter().position(|b| !b).unwrap_or_else(|| {
+            self.busy.push(false);
+            self.busy.len() - 1
+        });
         self.busy[i] = true;
-        let held = &mut self.recording.sizes.work[i];
-        *held = rounded(bytes).max(*held);
+        if let Some(held) = self.recording.sizes.work.get_mut(i) {
+            *held = rounded(bytes).max(*held);
+        }
         Buffer::Work(i as u8)
     }
 
@@ -76,14 +78,20 @@ impl Recorder {
         to
     }
 
-    /// The recording; `None` where it would take more buffers than there are.
-    pub fn finish(mut self) -> Option<Recording> {
+    /// The recording.
+    ///
+    /// # Errors
+    /// It would take more buffers than there are.
+    pub fn finish(mut self) -> Result<Recording, Unfit> {
+        if self.busy.len() > WORK {
+            return Err(Unfit::Buffers(self.busy.len()));
+        }
         let sizes = &mut self.recording.sizes;
         sizes.params = (self.recording.commands.iter().filter(|c| matches!(c, Command::Dispatch(_))).count() as u64)
             .max(1)
             * PARAMS_STRIDE;
         sizes.tables = rounded(self.recording.tables.len() as u64 * 4);
-        (!self.beyond).then_some(self.recording)
+        Ok(self.recording)
     }
 }
 
@@ -124,6 +132,6 @@ mod tests {
         assert_eq!((recording.fault(), recording.tables), (None, vec![1, 2, 3]));
         let mut recorder = Recorder::new(0);
         (0..=WORK).for_each(|_| assert!(matches!(recorder.take(4), Buffer::Work(_))));
-        assert!(recorder.finish().is_none());
+        assert_eq!(recorder.finish(), Err(Unfit::Buffers(WORK + 1)));
     }
 }

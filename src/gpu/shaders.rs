@@ -35,11 +35,13 @@ pub enum Shader {
     LevelWrite,
     Point,
     Marks,
+    Masked,
+    Extend,
     SweepCodes,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 17] = [
+    pub const ALL: [Shader; 19] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -56,6 +58,8 @@ impl Shader {
         Shader::LevelWrite,
         Shader::Point,
         Shader::Marks,
+        Shader::Masked,
+        Shader::Extend,
         Shader::SweepCodes,
     ];
 
@@ -85,6 +89,8 @@ impl Shader {
             Shader::LevelWrite => composed!("common", "integers64", "double", "entries", "level_cells", "level_write"),
             Shader::Point => composed!("common", "integers64", "double", "point"),
             Shader::Marks => composed!("common", "marks"),
+            Shader::Masked => composed!("common", "masked"),
+            Shader::Extend => composed!("common", "extend"),
             Shader::SweepCodes => composed!("common", "sweep_codes"),
         }
     }
@@ -110,6 +116,8 @@ impl Shader {
             Shader::Finish | Shader::Codes => &["finish"],
             Shader::Point => &["point"],
             Shader::Marks => &["look"],
+            Shader::Masked => &["fill"],
+            Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
             _ => &["first", "next"],
         }
@@ -119,8 +127,8 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Codes | Shader::Point => 5,
-            Shader::Obscurance | Shader::Finish => 4,
-            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool | Shader::LevelPool => 3,
+            Shader::Obscurance | Shader::Finish | Shader::LevelPool => 4,
+            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
             _ => 2,
         }
     }
@@ -131,5 +139,5 @@ impl Shader {
     }
 }
 
-/// Most storage bindings of a shader; every Vulkan adapter has more.
+/// Most storage bindings of a shader; every adapter has more.
 pub const MOST_BINDINGS: u32 = 5;

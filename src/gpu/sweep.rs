@@ -1,9 +1,10 @@
 //! Obscurance: how a brick is cut into parts that fit the device, the tables of displacements and contributions, and one
 //! dispatch (or a few) per family of lines. Pure arithmetic, shared by planner and engine.
 
-use super::passes::{Stored, cut};
+use super::passes::Stored;
 use super::record::{Bind, Buffer, GROUP, Recording, Shader, Sizes};
 use super::recorder::Recorder;
+use super::unfit::{Unfit, cut_to};
 use crate::grid::{DType, Region, Shape};
 use crate::kernel::obscurance::{Prepared, shared};
 
@@ -92,13 +93,15 @@ impl<'a> SweepJob<'a> {
         SweepPart { dst, src: dst.grow(self.sweep.reach()).clip(&self.src) }
     }
 
-    /// Parts of which every buffer is at most `cap` bytes; `None` where that is not to be had, or not worth it.
-    pub fn parts(&self, cap: u64) -> Option<Vec<SweepPart>> {
-        let fits = |lo, shape| self.sizes(&self.part(lo, shape), cap).is_some_and(|s| s.largest() <= cap);
-        let boxes = cut(self.dst.shape(), fits)?;
+    /// Parts of which every buffer is at most `cap` bytes.
+    ///
+    /// # Errors
+    /// That is not to be had, or not worth it.
+    pub fn parts(&self, cap: u64) -> Result<Vec<SweepPart>, Unfit> {
+        let boxes = cut_to(self.dst.shape(), cap, |lo, shape| Ok(self.recorded(&self.part(lo, shape), cap)?.sizes))?;
         let parts: Vec<SweepPart> = boxes.into_iter().map(|(lo, shape)| self.part(lo, shape)).collect();
-        let read: usize = parts.iter().map(|p| p.src.voxels()).sum();
-        (parts.len() == 1 || read <= MOST_REPEATED * self.src.voxels()).then_some(parts)
+        repeated(parts.iter().map(|p| p.src.voxels()), self.src.voxels())?;
+        Ok(parts)
     }
 
     /// The voxels that the lines of a family can meet on their way through a part.
@@ -107,19 +110,16 @@ impl<'a> SweepJob<'a> {
     }
 
     /// Lines that are swept at once, so that their links stay below `cap` bytes: whole workgroups.
-    fn batch(planes: usize, lines: usize, cap: u64) -> Option<usize> {
-        let most = (cap / (4 * planes.max(1) as u64)) as usize / GROUP as usize * GROUP as usize;
-        (most > 0).then_some(lines.min(most))
-    }
-
-    fn sizes(&self, part: &SweepPart, cap: u64) -> Option<Sizes> {
-        self.recorded(part, cap).map(|r| r.sizes)
+    fn batch(planes: usize, lines: usize, cap: u64) -> Result<usize, Unfit> {
+        let link = 4 * planes.max(1) as u64;
+        let most = (cap / link) as usize / GROUP as usize * GROUP as usize;
+        if most > 0 { Ok(lines.min(most)) } else { Err(Unfit::Bytes { needed: link * GROUP as u64, cap }) }
     }
 
     /// Largest buffers of any part.
     pub fn slot(&self, cap: u64) -> Sizes {
         let parts = self.parts(cap).unwrap_or_default();
-        parts.iter().filter_map(|p| self.sizes(p, cap)).fold(Sizes::default(), Sizes::max)
+        parts.iter().map(|p| self.record(p, cap).sizes).fold(Sizes::default(), Sizes::max)
     }
 
     /// All families over a part, and that the sums come back. Panics for a part that [`Self::parts`] did not give for this
@@ -128,7 +128,7 @@ impl<'a> SweepJob<'a> {
         self.recorded(part, cap).expect("a part that fits")
     }
 
-    fn recorded(&self, part: &SweepPart, cap: u64) -> Option<Recording> {
+    fn recorded(&self, part: &SweepPart, cap: u64) -> Result<Recording, Unfit> {
         let [nz, ny, _] = part.src.shape();
         let mut recorder = Recorder::new((nz * ny * part.pitch(self.code) * self.code) as u64);
         let sums = self.sums(part, Buffer::Source.into(), cap, &mut recorder)?;
@@ -136,15 +136,17 @@ impl<'a> SweepJob<'a> {
         recorder.finish()
     }
 
-    /// Sums of contributions over a part, left on the device, from codes of all of its source. `None` where links do not stay
-    /// below `cap` bytes.
-    pub(super) fn sums(&self, part: &SweepPart, codes: Bind, cap: u64, to: &mut Recorder) -> Option<Buffer> {
+    /// Sums of contributions over a part, left on the device, from codes of all of its source.
+    ///
+    /// # Errors
+    /// Links do not stay below `cap` bytes.
+    pub(super) fn sums(&self, part: &SweepPart, codes: Bind, cap: u64, to: &mut Recorder) -> Result<Buffer, Unfit> {
         let sums = to.take(part.dst.voxels() as u64 * 4);
         let batches = self.sweep.lines().map(|family| {
             let (planes, lines) = extent(&self.family_box(part, &family), family.axis());
             Self::batch(planes, lines, cap).map(|batch| (batch, (planes * batch * 4) as u64))
         });
-        let batches: Vec<(usize, u64)> = batches.collect::<Option<_>>()?;
+        let batches: Vec<(usize, u64)> = batches.collect::<Result<_, _>>()?;
         let links = to.take(batches.iter().map(|b| b.1).max().unwrap_or(0));
         for (number, (family, (batch, _))) in self.sweep.lines().zip(batches).enumerate() {
             let mut tables = Vec::new();
@@ -161,7 +163,7 @@ impl<'a> SweepJob<'a> {
             }
         }
         to.give(links);
-        Some(sums)
+        Ok(sums)
     }
 
     /// Parameters of one family; its displacements and contributions are put at the end of `tables`.
@@ -207,6 +209,13 @@ impl<'a> SweepJob<'a> {
             ..Lines::default()
         }
     }
+}
+
+/// Whether parts that read so many voxels each are worth it for a box of `once`.
+pub(super) fn repeated(reads: impl ExactSizeIterator<Item = usize>, once: usize) -> Result<(), Unfit> {
+    let parts = reads.len();
+    let read: usize = reads.sum();
+    if parts == 1 || read <= MOST_REPEATED * once { Ok(()) } else { Err(Unfit::Repeated { parts, read, once }) }
 }
 
 /// Dominant axis, then the others in natural order: neighbouring threads are neighbours along the last.
@@ -292,6 +301,6 @@ mod tests {
         let sweep = prepared(42, 6.0, [1.0; 3]);
         let whole = Region::whole([40, 30, 50]);
         assert!(SweepJob::new(&sweep, DType::F64, whole, whole).is_none());
-        assert!(SweepJob::new(&sweep, DType::U8, whole, whole).unwrap().parts(2000).is_none());
+        assert!(SweepJob::new(&sweep, DType::U8, whole, whole).unwrap().parts(2000).is_err());
     }
 }

@@ -70,6 +70,19 @@ impl TapsJob {
         Some(TapsJob { src, dst, at, sigma, radius: gaussian::shared::radius(sigma, src), voxel, signed, moments })
     }
 
+    /// One voxel of a volume of this extent, with all that its window sees wherever it lies.
+    pub fn one(dtype: DType, volume: Shape, sigma: [f64; 3], moments: Wanted) -> Option<TapsJob> {
+        let radius = gaussian::shared::radius(sigma, volume);
+        let src = std::array::from_fn(|a| (2 * radius[a] + 1).min(volume[a]));
+        let at = std::array::from_fn(|a| radius[a].min(src[a] - 1));
+        TapsJob::new(dtype, src, [1; 3], at, sigma, moments)
+    }
+
+    /// Whether it is recorded in buffers of at most `cap` bytes.
+    pub fn fits(&self, cap: u64) -> bool {
+        self.sizes(&self.part([0; 3], self.dst)).largest() <= cap
+    }
+
     pub(super) fn part(&self, lo: [usize; 3], dst: Shape) -> Part {
         Part::around(self.src, self.at, self.radius, lo, dst)
     }

@@ -4,6 +4,8 @@
 use super::graph::{GradientChannel, Graph, Moment, Producer, Step, StepId, StepKind, TransferChannel, Wire, WireId};
 use super::memory::wire_box;
 use super::{Group, OutputPlan, Plan};
+use crate::brick::Voxels;
+use crate::gpu::extend::Beyond;
 use crate::gpu::finish::Channels;
 use crate::gpu::flow::{Flow, FlowStep, Input, Kernel, Sink};
 use crate::gpu::levels::Pyramid;
@@ -28,6 +30,13 @@ impl FlowPlan {
     pub fn first(&self, steps: &[StepId]) -> Option<StepId> {
         self.steps.iter().copied().find(|s| steps.contains(s))
     }
+
+    /// Without some of its steps, and without what reads them.
+    pub fn without(&self, graph: &Graph, out: &[StepId]) -> FlowPlan {
+        let mut flow = self.clone();
+        leave(graph, &mut flow, out.to_vec());
+        flow
+    }
 }
 
 /// Why a step that looks at one voxel runs on the CPU.
@@ -40,24 +49,11 @@ pub fn find(graph: &Graph, on_gpu: &[bool]) -> Vec<FlowPlan> {
     let mut flows: Vec<FlowPlan> = Vec::new();
     for (s, step) in graph.steps.iter().enumerate() {
         let point = !ops(graph, step, &[]).is_empty();
-        if step.mask.is_some() || step.streamed.is_some() || !(point || on_gpu[s] && has_kernel(graph, step)) {
+        if !mask_is_read(graph, step) || step.streamed.is_some() || !(point || on_gpu[s] && has_kernel(graph, step)) {
             continue;
         }
         let Some(at) = flow_of(graph, &mut flows, step, point) else { continue };
-        let over_source = step.inputs.iter().any(|&w| flows[at].source == w);
-        if !over_source && !reads_made(graph, step) {
-            continue;
-        }
         flows[at].steps.push(s);
-    }
-    // Where a step's windows look beyond the volume the host gives what is there, which others must not see.
-    for flow in &mut flows {
-        let reads = |s: &StepId| graph.steps[*s].inputs.contains(&flow.source);
-        let many = flow.steps.iter().filter(|s| reads(s)).count() > 1;
-        if many && flow.steps.iter().any(|s| padded(&graph.steps[*s])) {
-            let out: Vec<StepId> = flow.steps.iter().copied().filter(|s| padded(&graph.steps[*s])).collect();
-            leave(graph, flow, out);
-        }
     }
     flows.retain(|f| f.steps.iter().any(|&s| on_gpu[s]));
     flows
@@ -108,19 +104,23 @@ fn is_source(wire: &Wire) -> bool {
     wire.components == 1 && wire.missing.is_none() && stored(wire.dtype).is_some()
 }
 
-/// Whether a step with windows can read what others made on the device.
-fn reads_made(graph: &Graph, step: &Step) -> bool {
-    matches!(step.border, Border::Clip) || matches!(step.kind, StepKind::Gradient { .. }) || {
-        !ops(graph, step, &[]).is_empty()
-    }
+/// Whether a step's mask, if it has one, is known before anything is made: it hangs on an input.
+fn mask_is_read(graph: &Graph, step: &Step) -> bool {
+    step.mask.as_ref().is_none_or(|m| matches!(graph.wires[m.wire].producer, Producer::Input(_)))
 }
 
-/// Whether the host gives a step's voxels beyond the volume.
-fn padded(step: &Step) -> bool {
-    match step.kind {
-        StepKind::Window { .. } | StepKind::Gaussian { .. } => step.border != Border::Clip,
-        _ => false,
+/// What a step's windows see beyond the volume, as the channel that they read has it on the device.
+fn beyond(graph: &Graph, step: &Step, made: bool) -> Beyond {
+    if step.border == Border::Clip {
+        return Beyond { border: Border::Clip, outside: 0 };
     }
+    let wire = &graph.wires[step.inputs[0]];
+    let (outside, _) = wire.beyond(step.border);
+    let mut one = Voxels::zeroed(if made { DType::F32 } else { wire.dtype }, 1);
+    one.fill(outside);
+    let mut bits = [0; 4];
+    bits[..one.as_bytes().len()].copy_from_slice(one.as_bytes());
+    Beyond { border: step.border, outside: u32::from_le_bytes(bits) }
 }
 
 /// Whether a flow has a kernel for a step with windows; its input's type was looked at when it was placed.
@@ -200,7 +200,12 @@ pub struct Site<'a> {
     pub brick: Region,
     /// Numbers from pre-passes.
     pub globals: &'a [Vec<f64>],
+    /// Whether a step's mask excludes some voxels.
+    pub masked: &'a dyn Fn(StepId) -> bool,
 }
+
+/// As if every mask excluded some.
+pub const ALL_MASKED: &dyn Fn(StepId) -> bool = &|_| true;
 
 /// A flow over one brick, and where each sink goes. `None` where nothing of it is wanted.
 pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Target>)> {
@@ -221,7 +226,8 @@ pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Tar
             kernel: kernel(graph, step, site.globals),
             inputs: inputs.map(|(w, c)| input(w, c)).collect(),
             reach: step.reach,
-            padded: padded(step),
+            beyond: beyond(graph, step, at(step.inputs[0]).is_some()),
+            fills: (step.mask.is_some() && (site.masked)(s)).then(|| fills(graph, step)),
         }
     };
     let (mut sinks, mut targets) = (Vec::new(), Vec::new());
@@ -247,6 +253,17 @@ pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Tar
     let (dtype, affine, volume) = (source.dtype, source.affine, Region::whole(site.volume));
     let flow = Flow { dtype, affine, volume, steps: steps.iter().map(flow_step).collect(), sinks };
     (!flow.sinks.is_empty()).then_some((flow, targets))
+}
+
+/// By channel, what stands where a masked step's voxels are not needed, as the channel's type holds it.
+fn fills(graph: &Graph, step: &Step) -> Vec<f32> {
+    let of = |w: &WireId| {
+        let wire = &graph.wires[*w];
+        let mut fill = Voxels::zeroed(wire.dtype, 1);
+        fill.fill(wire.fill);
+        vec![fill.at(0) as f32; wire.components]
+    };
+    step.outputs.iter().flat_map(of).collect()
 }
 
 /// Which of these steps makes a wire.
@@ -287,7 +304,8 @@ fn comes_back(plan: &Plan, site: &Site, steps: &[StepId], w: WireId, at: &dyn Fn
 /// Whether a flow gives the host the voxels of a wire that it makes.
 pub fn voxels_come_back(plan: &Plan, flow: &FlowPlan, group: &Group, w: WireId) -> bool {
     let (steps, outputs) = (&group.steps[..], &group.outputs[..]);
-    let site = Site { steps, outputs, volume: group.shape, brick: Region::whole([0; 3]), globals: &[] };
+    let site =
+        Site { steps, outputs, volume: group.shape, brick: Region::whole([0; 3]), globals: &[], masked: ALL_MASKED };
     let at = |w| maker(&plan.graph, &flow.steps, w);
     comes_back(plan, &site, &flow.steps, w, &at)
 }

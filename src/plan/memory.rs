@@ -3,6 +3,7 @@
 use super::graph::{GradientChannel, Moment, Step, StepId, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan, flows};
+use crate::gpu::flow::Flow;
 use crate::gpu::{facts, passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, levels, moments4, obscurance, rank, reduce, window};
@@ -146,12 +147,7 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
     let cap = gpu.buffer_cap(plan.memory);
     let steps = group.steps.iter().filter(|&&s| plan.on_gpu(s));
     let sizes = steps.map(|&s| slot_sizes(plan, group, &plan.graph.steps[s], cap));
-    let flows = plan.flows.iter().filter_map(|f| {
-        let brick = inner(group.region, group.brick.shape, group.align);
-        let (steps, outputs) = (&group.steps[..], &group.outputs[..]);
-        let site = flows::Site { steps, outputs, volume: group.shape, brick, globals: &[] };
-        Some(flows::build(plan, f, &site)?.0.slot(cap))
-    });
+    let flows = plan.flows.iter().filter_map(|f| Some(inner_flow(plan, f, group)?.slot(cap)));
     let maps = group.outputs.iter().filter(|&&o| plan.map_on_gpu(o)).filter_map(|&o| {
         // A brick in the middle of the map, where it sees most.
         let job = plan.outputs[o].map_job(&plan.graph)?;
@@ -163,6 +159,14 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
     });
     facts::SLOTS
         * sizes.chain(maps).chain(flows).fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
+}
+
+/// A flow over a brick in the middle of its group, where it sees most; `None` where the group has none of it.
+pub fn inner_flow(plan: &Plan, flow: &flows::FlowPlan, group: &Group) -> Option<Flow> {
+    let brick = inner(group.region, group.brick.shape, group.align);
+    let (steps, outputs) = (&group.steps[..], &group.outputs[..]);
+    let site = flows::Site { steps, outputs, volume: group.shape, brick, globals: &[], masked: flows::ALL_MASKED };
+    Some(flows::build(plan, flow, &site)?.0)
 }
 
 /// A brick in the middle of a region, where it sees most.
@@ -190,12 +194,7 @@ fn level_bytes(plan: &Plan, group: &Group, flow: &flows::FlowPlan, brick: Shape)
 
 /// Largest buffers that a step needs on the GPU.
 fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Sizes {
-    let dst = grown(group.brick.shape, step.halo, group.shape);
-    let src: Shape = std::array::from_fn(|a| {
-        let padded = dst[a] + 2 * step.reach[a];
-        if step.border == Border::Clip { padded.min(group.shape[a]) } else { padded }
-    });
-    let at: [usize; 3] = std::array::from_fn(|a| step.reach[a].min(src[a] - dst[a]));
+    let (src, dst, at) = sees(group, step);
     let dtype = plan.graph.wires[step.inputs[0]].dtype;
     match &step.kind {
         StepKind::Window { params, channels } => {
@@ -203,12 +202,8 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
             let job = passes::Job::new(dtype, src, dst, at, params.radius, needs);
             job.map_or(record::Sizes::default(), |j| j.finished(params, channels).slot(cap))
         }
-        StepKind::Obscurance { params, .. } => {
-            let prepared = obscurance::Prepared::new(params);
-            let from = at.map(|n| n as i64);
-            let inner = Region::new(from, std::array::from_fn(|a| from[a] + dst[a] as i64));
-            let job = sweep::SweepJob::new(&prepared, dtype, Region::whole(src), inner);
-            job.map_or(record::Sizes::default(), |j| j.slot(cap))
+        StepKind::Obscurance { .. } => {
+            with_sweep(plan, group, step, |job| job.map_or(record::Sizes::default(), |j| j.slot(cap)))
         }
         StepKind::Gaussian { sigma, channels } => {
             let [mean, variance] = [Moment::Mean, Moment::Variance].map(|m| channels.contains(&m));
@@ -222,6 +217,26 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
         }
         _ => record::Sizes::default(),
     }
+}
+
+/// A sweep's job on a brick in the middle of its group; `None` where there is no kernel.
+pub fn with_sweep<R>(plan: &Plan, group: &Group, step: &Step, f: impl FnOnce(Option<sweep::SweepJob>) -> R) -> R {
+    let StepKind::Obscurance { params, .. } = &step.kind else { return f(None) };
+    let (src, dst, at) = sees(group, step);
+    let prepared = obscurance::Prepared::new(params);
+    let from = at.map(|n| n as i64);
+    let inner = Region::new(from, std::array::from_fn(|a| from[a] + dst[a] as i64));
+    f(sweep::SweepJob::new(&prepared, plan.graph.wires[step.inputs[0]].dtype, Region::whole(src), inner))
+}
+
+/// Extents of what a step reads and makes of a brick in the middle, and where the one lies in the other.
+fn sees(group: &Group, step: &Step) -> (Shape, Shape, [usize; 3]) {
+    let dst = grown(group.brick.shape, step.halo, group.shape);
+    let src: Shape = std::array::from_fn(|a| {
+        let padded = dst[a] + 2 * step.reach[a];
+        if step.border == Border::Clip { padded.min(group.shape[a]) } else { padded }
+    });
+    (src, dst, std::array::from_fn(|a| step.reach[a].min(src[a] - dst[a])))
 }
 
 /// Element type that a window kernel sees: a constant border may need a float where the input's type cannot hold it.

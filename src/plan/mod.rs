@@ -3,6 +3,7 @@
 
 pub mod brick;
 pub mod explain;
+mod fits;
 pub mod flows;
 pub mod graph;
 pub mod lengths;
@@ -23,6 +24,7 @@ pub use tasks::{Group, Task};
 
 use crate::config::{Config, Device, Lanes};
 use crate::gpu::passes::Job;
+use crate::gpu::taps::{TapsJob, Wanted};
 use crate::gpu::{GpuFacts, facts};
 use crate::grid::Border;
 use crate::kernel::window::Needs;
@@ -70,6 +72,8 @@ pub struct Plan {
     pub warnings: Vec<String>,
     /// Why stages run where they run, one line each.
     pub placement: Placement,
+    /// Stages and devices before flows and bricks were looked at, which change no voxel and may be others in a resumed run.
+    pub held: Vec<(String, &'static str)>,
     /// The adapter that the steps placed on "gpu" run on.
     pub gpu: Option<GpuFacts>,
     /// Steps that run on the GPU together.
@@ -88,6 +92,7 @@ impl Plan {
         };
         let graph = lowered.graph;
         let (mut placement, gpu) = placement(config, &graph, &outputs, find_gpu)?;
+        let held = placement.iter().map(|(name, device, _)| (name.clone(), *device)).collect();
         let flows = join_flows(&graph, &mut placement);
         let warnings = warnings(&graph);
         let mut plan = Plan {
@@ -102,6 +107,7 @@ impl Plan {
             memory: config.run.memory,
             warnings,
             placement,
+            held,
             gpu,
             flows,
         };
@@ -109,6 +115,7 @@ impl Plan {
             plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
         }
         streams::choose(&mut plan, config)?;
+        fits::settle(&mut plan);
         Ok(plan)
     }
 
@@ -231,13 +238,11 @@ fn join_flows(graph: &Graph, placement: &mut Placement) -> Vec<FlowPlan> {
 
 /// Whether a step on the GPU makes floats there that are not the CPU's bit for bit.
 fn floats(graph: &Graph, step: &graph::Step) -> bool {
-    let open = |c: &WindowChannel| matches!(c, WindowChannel::Openness(..));
-    exact(graph, step)
-        || match &step.kind {
-            graph::StepKind::Gradient { .. } => true,
-            graph::StepKind::Window { channels, .. } => channels.iter().any(open),
-            _ => false,
-        }
+    exact(graph, step) || Work::Step(step).close()
+}
+
+fn is_open(channel: &WindowChannel) -> bool {
+    matches!(channel, WindowChannel::Openness(..))
 }
 
 /// Whether a step needs [`GpuFacts::exact_floats`].
@@ -277,6 +282,7 @@ fn placement(
         (None, _) if config.run.device == Device::Cpu => ("cpu", "device = \"cpu\"".to_string()),
         (_, Err(why)) => ("cpu", why.to_string()),
         (Some(Ok(gpu)), Ok(())) if exact && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
+        (Some(Ok(gpu)), Ok(())) if of.close() && !gpu.close_floats => ("cpu", facts::ROUGH.to_string()),
         (Some(Ok(gpu)), Ok(())) => match of.too_large(graph, gpu.buffer_cap(config.run.memory)) {
             Some(why) => ("cpu", why.to_string()),
             None => ("gpu", gpu.name.clone()),
@@ -303,6 +309,16 @@ enum Work<'a> {
 }
 
 impl Work<'_> {
+    /// Whether it needs [`GpuFacts::close_floats`].
+    fn close(self) -> bool {
+        let Work::Step(step) = self else { return false };
+        match &step.kind {
+            graph::StepKind::Gradient { .. } => true,
+            graph::StepKind::Window { channels, .. } => channels.iter().any(is_open),
+            _ => false,
+        }
+    }
+
     /// Why it stays on the CPU, where not even one voxel of it fits the device's buffers: floats must be one lane's.
     fn too_large(self, graph: &Graph, cap: u64) -> Option<&'static str> {
         match self {
@@ -311,12 +327,21 @@ impl Work<'_> {
                 (!fits).then_some(facts::MAP_TOO_LARGE)
             }
             Work::Step(step) => {
-                let graph::StepKind::Window { params, channels } = &step.kind else { return None };
                 let wire = &graph.wires[step.inputs[0]];
                 let volume = graph.lattices[wire.lattice].shape;
-                let needs = Needs::of(channels.iter().copied(), wire.dtype.is_float());
-                let job = Job::new(wire.dtype, volume, volume, [0; 3], params.radius, needs);
-                let fits = job.is_some_and(|job| job.finished(params, channels).fits(volume, cap));
+                let fits = match &step.kind {
+                    graph::StepKind::Window { params, channels } => {
+                        let needs = Needs::of(channels.iter().copied(), wire.dtype.is_float());
+                        let job = Job::new(wire.dtype, volume, volume, [0; 3], params.radius, needs);
+                        job.is_some_and(|job| job.finished(params, channels).fits(volume, cap))
+                    }
+                    graph::StepKind::Gaussian { sigma, channels } => {
+                        let [mean, variance] =
+                            [graph::Moment::Mean, graph::Moment::Variance].map(|m| channels.contains(&m));
+                        TapsJob::one(wire.dtype, volume, *sigma, Wanted { mean, variance }).is_some_and(|j| j.fits(cap))
+                    }
+                    _ => true,
+                };
                 (!fits).then_some(facts::WINDOW_TOO_LARGE)
             }
         }

@@ -62,29 +62,31 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
     let (mut made, mut ready) = (Vec::new(), Vec::new());
     for (at, &s) in program.steps.iter().enumerate() {
         let step = &plan.graph.steps[s];
+        if let Some(flow) = program.flow_at(s) {
+            let start = Instant::now();
+            if let Some(done) = engine.flow(program, flow, &mut values, &masks, &needed, brick)? {
+                ran = true;
+                let voxels = |t| program.step_box(plan, t, brick).voxels() as u64;
+                match flow.steps[..] {
+                    [only] => metrics.step(only, start, voxels(only)),
+                    _ => {
+                        metrics.flow(plan.flow_of(s).unwrap_or_default(), start, brick.voxels() as u64);
+                        done.steps.iter().for_each(|&t| metrics.step_in_flow(t, voxels(t)));
+                    }
+                }
+                let names: Vec<String> = done.steps.iter().flat_map(|t| plan.graph.steps[*t].stages.clone()).collect();
+                trace.span(&names.join("+"), start, &[("brick", format!("{brick:?}"))]);
+                made.extend(done.steps);
+                ready.extend(done.ready);
+                done.values.into_iter().for_each(|(w, value)| values[w] = Some(value));
+            }
+        }
         if made.contains(&s) {
             release(engine, program, at, &mut values);
             continue;
         }
         if !step.outputs.iter().any(|&w| needed[w]) {
             continue;
-        }
-        if let Some(flow) = program.flow_at(s) {
-            let start = Instant::now();
-            if let Some(done) = engine.flow(program, flow, &mut values, brick)? {
-                ran = true;
-                made.extend(flow.steps.iter().copied());
-                for (k, &t) in flow.steps.iter().enumerate() {
-                    let voxels = program.step_box(plan, t, brick).voxels() as u64;
-                    metrics.step(t, if k == 0 { start } else { Instant::now() }, voxels);
-                }
-                let names: Vec<String> = flow.steps.iter().flat_map(|t| plan.graph.steps[*t].stages.clone()).collect();
-                trace.span(&names.join("+"), start, &[("brick", format!("{brick:?}"))]);
-                ready.extend(done.ready);
-                done.values.into_iter().for_each(|(w, value)| values[w] = Some(value));
-                release(engine, program, at, &mut values);
-                continue;
-            }
         }
         let region = program.step_box(plan, s, brick);
         if let Some(mask) = &step.mask

@@ -1,14 +1,14 @@
 //! Steps that run on the GPU together on one brick: what comes back of them, voxels that the host needs and levels of outputs.
 
 use super::program::Program;
-use super::steps::Engine;
+use super::steps::{Engine, MaskValue};
 use super::value::{Comp, Value};
 use crate::Result;
 use crate::brick::{Pool, Voxels};
 use crate::gpu::flow::{Flow, Sink};
 use crate::gpu::levels::Pyramid;
-use crate::gpu::{Gpu, SinkOut};
-use crate::grid::{DType, Region};
+use crate::gpu::{Gpu, Needed, SinkOut};
+use crate::grid::{DType, Region, View};
 use crate::plan::FlowPlan;
 use crate::plan::flows::{Site, Target, build};
 use crate::plan::graph::{StepId, WireId};
@@ -26,6 +26,8 @@ pub struct Ready {
 /// What a flow made.
 #[derive(Debug, Default)]
 pub struct FlowDone {
+    /// Its steps, without those that nobody needs on this brick.
+    pub steps: Vec<StepId>,
     pub values: Vec<(WireId, Value)>,
     pub ready: Vec<Ready>,
 }
@@ -37,7 +39,8 @@ enum Room {
 }
 
 impl Engine<'_> {
-    /// All steps of a flow on a brick; `None` where they run one by one.
+    /// All steps of a flow that somebody needs on a brick, but for those without a needed voxel and their readers, which are
+    /// constants or next to it; `None` where they run one by one. `needed` is by wire.
     ///
     /// # Errors
     /// A GPU that failed twice.
@@ -46,12 +49,22 @@ impl Engine<'_> {
         program: &Program,
         flow: &FlowPlan,
         values: &mut [Option<Value>],
+        masks: &[(StepId, MaskValue)],
+        needed: &[bool],
         brick: Region,
     ) -> Result<Option<FlowDone>> {
         let plan = self.plan;
+        let mask = |s: StepId| masks.iter().find(|(m, _)| *m == s).map(|(_, m)| m);
+        let masked = |s: StepId| matches!(mask(s), Some(MaskValue::Some(_)));
+        let off = |s: StepId| matches!(mask(s), Some(MaskValue::None));
+        let live = |s: StepId| !off(s) && plan.graph.steps[s].outputs.iter().any(|&w| needed[w]);
+        let steps: Vec<StepId> = program.steps.iter().copied().filter(|&s| live(s)).collect();
+        let out: Vec<StepId> = flow.steps.iter().copied().filter(|s| !steps.contains(s)).collect();
+        let flow = &flow.without(&plan.graph, &out);
         let Some(gpu) = self.flow_lane(flow) else { return Ok(None) };
-        let (steps, outputs) = (&program.steps[..], &program.outputs[..]);
-        let site = Site { steps, outputs, volume: program.volume, brick, globals: &self.globals };
+        let outputs = &program.outputs[..];
+        let site =
+            Site { steps: &steps, outputs, volume: program.volume, brick, globals: &self.globals, masked: &masked };
         let Some((recipe, targets)) = build(plan, flow, &site) else { return Ok(None) };
         let value = values[flow.source].as_mut().expect("what a flow reads is made before it");
         if self.skip && value.constants().is_some() {
@@ -61,40 +74,21 @@ impl Engine<'_> {
         let mut rooms: Vec<Room> = recipe.sinks.iter().zip(&targets).map(|(sink, t)| self.room(sink, t)).collect();
         let mut outs: Vec<SinkOut> = recipe.sinks.iter().zip(&mut rooms).map(|(s, r)| r.out(s)).collect();
         let failed = |e| self.gpu_failed(flow.steps[0], &e);
-        let done = match recipe.steps.iter().position(|s| s.padded) {
-            None => gpu.flow(&recipe, value.view(0, value.region), value.region, &mut outs),
-            Some(_) => self.padded_flow(gpu, &recipe, program, flow, value, brick, &mut outs),
-        };
+        let needed = flow.steps.iter().copied().enumerate().filter_map(|(step, s)| {
+            let region = program.step_box(plan, s, brick);
+            let Some(MaskValue::Some(mask)) = mask(s) else { return None };
+            Some(Needed { step, view: View::dense(mask, region.shape()), region })
+        });
+        let needed: Vec<Needed> = needed.collect();
+        let done = gpu.flow(&recipe, value.view(0, value.region), value.region, &needed, &mut outs);
         drop(outs);
         if done.map_err(failed)?.is_none() {
+            plan.flow_of(flow.steps[0]).into_iter().for_each(|f| self.metrics.flow_left(f));
             rooms.into_iter().for_each(|r| r.recycle(self.pool));
             return Ok(None);
         }
-        Ok(Some(collect(rooms, &targets, &recipe, |w| plan.graph.wires[w].dtype)))
-    }
-
-    /// A flow of which the one step that reads the source sees voxels beyond the volume.
-    #[allow(clippy::too_many_arguments)]
-    fn padded_flow(
-        &self,
-        gpu: &Gpu,
-        recipe: &Flow,
-        program: &Program,
-        flow: &FlowPlan,
-        value: &Value,
-        brick: Region,
-        outs: &mut [SinkOut],
-    ) -> std::result::Result<Option<crate::gpu::Times>, crate::gpu::GpuError> {
-        let graph = &self.plan.graph;
-        let reads = |s: &&StepId| graph.steps[**s].inputs.contains(&flow.source) && program.steps.contains(s);
-        let Some(&s) = flow.steps.iter().find(reads) else { return Ok(None) };
-        let step = &graph.steps[s];
-        let region = program.step_box(self.plan, s, brick);
-        let volume = Region::whole(program.volume);
-        let src = self.windowed(step, step.border, value, 0, &graph.wires[flow.source], region, volume);
-        let done = gpu.flow(recipe, src.view(), region.grow(step.reach), outs);
-        src.recycle(self.pool);
-        done
+        let done = collect(rooms, &targets, &recipe, |w| plan.graph.wires[w].dtype);
+        Ok(Some(FlowDone { steps: flow.steps.clone(), ..done }))
     }
 
     /// The GPU, unless all of the steps' bricks may go to either lane and it is busy. The bits are the same.

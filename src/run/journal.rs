@@ -8,6 +8,7 @@ use std::sync::Mutex;
 
 use serde_json::{Value, json};
 
+use crate::store::os;
 use crate::{Error, Result};
 
 const HEADER: &str = "run.json";
@@ -65,7 +66,7 @@ impl Journal {
         file.write_all(header.to_string().as_bytes()).map_err(fail)?;
         file.sync_all().map_err(fail)?;
         std::fs::rename(&temp, &path).map_err(fail)?;
-        File::open(dir).and_then(|d| d.sync_all()).map_err(fail)
+        os::sync_dir(dir).map_err(fail)
     }
 
     /// Marks a task as done; everything that it wrote must be durable already.

@@ -27,14 +27,36 @@ pub struct Metrics {
     lines: Vec<[AtomicU64; 3]>,
     /// Bricks per step that the GPU left to the CPU.
     shared: Vec<AtomicU64>,
+    /// Per flow of several steps.
+    flows: Vec<FlowCounters>,
     /// Nanoseconds of reading, converting with levels, and encoding.
     pub read_ns: AtomicU64,
     pub encode_ns: AtomicU64,
     peak: AtomicU64,
 }
 
+#[derive(Debug, Default)]
+struct FlowCounters {
+    ns: AtomicU64,
+    voxels: AtomicU64,
+    bricks: AtomicU64,
+    left: AtomicU64,
+}
+
+/// What steps did that ran on the GPU in one go.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct FlowTotals {
+    /// Summed over threads.
+    pub seconds: f64,
+    /// Voxels of the bricks.
+    pub voxels: u64,
+    pub bricks: u64,
+    /// Bricks that the device left, whose steps ran one by one.
+    pub left: u64,
+}
+
 impl Metrics {
-    pub fn new(steps: usize) -> Metrics {
+    pub fn new(steps: usize, flows: usize) -> Metrics {
         Metrics {
             start: Instant::now(),
             bytes_read: AtomicU64::default(),
@@ -50,6 +72,7 @@ impl Metrics {
             steps: (0..steps).map(|_| Default::default()).collect(),
             lines: (0..steps).map(|_| Default::default()).collect(),
             shared: (0..steps).map(|_| Default::default()).collect(),
+            flows: (0..flows).map(|_| Default::default()).collect(),
             read_ns: AtomicU64::default(),
             encode_ns: AtomicU64::default(),
             peak: AtomicU64::default(),
@@ -102,6 +125,32 @@ impl Metrics {
     pub fn step(&self, step: usize, start: Instant, voxels: u64) {
         self.steps[step].0.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
         self.steps[step].1.fetch_add(voxels, Relaxed);
+    }
+
+    /// A step made voxels as part of a flow, which has the time.
+    pub fn step_in_flow(&self, step: usize, voxels: u64) {
+        self.steps[step].1.fetch_add(voxels, Relaxed);
+    }
+
+    /// A flow made a brick.
+    pub fn flow(&self, flow: usize, start: Instant, voxels: u64) {
+        let to = &self.flows[flow];
+        to.ns.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
+        to.voxels.fetch_add(voxels, Relaxed);
+        to.bricks.fetch_add(1, Relaxed);
+    }
+
+    /// The device left a brick of a flow.
+    pub fn flow_left(&self, flow: usize) {
+        self.flows[flow].left.fetch_add(1, Relaxed);
+    }
+
+    pub fn flow_totals(&self, flow: usize) -> FlowTotals {
+        let [ns, voxels, bricks, left] = {
+            let FlowCounters { ns, voxels, bricks, left } = &self.flows[flow];
+            [ns, voxels, bricks, left].map(|n| n.load(Relaxed))
+        };
+        FlowTotals { seconds: ns as f64 * 1e-9, voxels, bricks, left }
     }
 
     /// A sweep of a step looked at these lines.

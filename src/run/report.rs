@@ -4,6 +4,10 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use super::metrics::{FlowTotals, Metrics};
+use crate::plan::Plan;
+use crate::plan::graph::StepId;
+
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Report {
     /// Wall time.
@@ -44,6 +48,8 @@ pub struct StageReport {
     /// Time in its kernels, summed over threads.
     pub seconds: f64,
     pub device: String,
+    /// Why it ran there.
+    pub reason: String,
     pub voxels: u64,
     /// Of a stage on the GPU: bricks that CPU workers took while all of its slots were taken.
     pub bricks_on_cpu: u64,
@@ -51,4 +57,58 @@ pub struct StageReport {
     /// (`where`), or with nothing greater in reach (`open`).
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, u64>,
+    /// Of a stage that runs on the GPU in one go with others: the row that has their time. Its own is that of bricks that it
+    /// made by itself.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub part_of: Option<String>,
+    /// Of such a row.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub together: Option<Together>,
+}
+
+/// Stages that ran on the GPU in one go.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Together {
+    pub stages: Vec<String>,
+    /// Bricks made so, and bricks that the device left, whose stages ran one by one. Others had nothing to compute.
+    pub bricks: u64,
+    pub bricks_left: u64,
+}
+
+/// A row for every stage, and for all that ran on the GPU in one go.
+pub(super) fn stages(plan: &Plan, metrics: &Metrics) -> Vec<StageReport> {
+    let stages = (0..plan.graph.steps.len()).map(|s| stage(plan, metrics, s));
+    stages.chain((0..plan.flows.len()).filter_map(|f| flow(plan, metrics, f))).collect()
+}
+
+fn stage(plan: &Plan, metrics: &Metrics, s: StepId) -> StageReport {
+    let (seconds, voxels) = metrics.step_totals(s);
+    let (_, device, reason) = &plan.placement[s];
+    StageReport {
+        name: plan.graph.steps[s].stages.join("+"),
+        seconds,
+        device: device.to_string(),
+        reason: reason.clone(),
+        voxels,
+        bricks_on_cpu: metrics.shared_bricks(s),
+        lines: metrics.line_counts(s),
+        part_of: plan.flow_of(s).and_then(|f| flow(plan, metrics, f)).map(|r| r.name),
+        together: None,
+    }
+}
+
+/// The row of a flow; one of a single step is its stage's.
+fn flow(plan: &Plan, metrics: &Metrics, f: usize) -> Option<StageReport> {
+    let steps = &plan.flows[f].steps;
+    let stages: Vec<String> = steps.iter().map(|&s| plan.graph.steps[s].stages.join("+")).collect();
+    let FlowTotals { seconds, voxels, bricks, left } = metrics.flow_totals(f);
+    (steps.len() > 1).then(|| StageReport {
+        name: format!("{} in one go", stages.join(", ")),
+        seconds,
+        device: "gpu".into(),
+        reason: plan.placement[steps[0]].2.clone(),
+        voxels,
+        together: Some(Together { stages, bricks, bricks_left: left }),
+        ..StageReport::default()
+    })
 }

@@ -16,7 +16,7 @@ use super::outputs::{self, Start};
 use super::prepass::Finder;
 use super::program::Program;
 use super::read::Reader;
-use super::report::{Report, StageReport};
+use super::report::{self, Report};
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
@@ -86,8 +86,8 @@ impl<'a> Session<'a> {
         plan.gpu_note(config).iter().for_each(|n| progress.note(n));
         let identities = sources.iter().map(Source::identity).collect::<Result<Vec<_>>>()?;
         let hash = config_hash(config);
-        let placement = placement_json(&plan);
-        let header = journal::header(&hash, &identities, plan.task_count(), &placement, &[]);
+        let mut header = journal::header(&hash, &identities, plan.task_count(), &json!(plan.held), &[]);
+        header["reasons"] = reasons(&plan);
         let mut claims = outputs::claim_begun(config, &plan)?;
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
         if start != Start::Complete {
@@ -103,7 +103,7 @@ impl<'a> Session<'a> {
             config,
             options,
             progress,
-            metrics: Metrics::new(plan.graph.steps.len()),
+            metrics: Metrics::new(plan.graph.steps.len(), plan.flows.len()),
             targets: plan.outputs.iter().map(|_| None).collect(),
             plan,
             gpu,
@@ -325,7 +325,7 @@ impl<'a> Session<'a> {
             found.add(&self.plan, &prepass.wires, done);
             Ok(Vec::new())
         };
-        let metrics = Metrics::new(self.plan.graph.steps.len());
+        let metrics = Metrics::new(self.plan.graph.steps.len(), self.plan.flows.len());
         let tick = || {
             let (bricks, voxels) = metrics.done();
             self.tick(
@@ -446,14 +446,7 @@ impl<'a> Session<'a> {
         self.metrics.fill(&mut report, self.plan.voxels());
         report.bricks.total = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
         report.memory_budget_bytes = self.plan.memory;
-        for (s, step) in self.plan.graph.steps.iter().enumerate() {
-            let (seconds, voxels) = self.metrics.step_totals(s);
-            let device = self.plan.placement[s].1.into();
-            let bricks_on_cpu = self.metrics.shared_bricks(s);
-            let lines = self.metrics.line_counts(s);
-            let name = step.stages.join("+");
-            report.stages.push(StageReport { name, seconds, device, voxels, bricks_on_cpu, lines });
-        }
+        report.stages = report::stages(&self.plan, &self.metrics);
         report.byte_identity_waived = self.plan.waives_byte_identity();
         report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();
         report
@@ -473,9 +466,9 @@ impl<'a> Session<'a> {
     }
 }
 
-/// The placement as the journal keeps it.
-fn placement_json(plan: &Plan) -> Value {
-    json!(plan.placement.iter().map(|(n, d, _)| (n.clone(), *d)).collect::<Vec<_>>())
+/// Where everything runs and why, for who reads the journal.
+fn reasons(plan: &Plan) -> Value {
+    plan.placement.iter().map(|(name, device, why)| json!({ "stage": name, "device": device, "why": why })).collect()
 }
 
 /// Plans, and opens the GPU where a step runs on it. With `auto`, a run that was begun without a GPU goes on without one.
@@ -484,7 +477,7 @@ fn plan_and_gpu(config: &Config, infos: &[VolumeInfo], resume: bool) -> Result<(
     let plan = Plan::new(config, infos, &mut || gpu::find(config.run.device, &mut opened))?;
     let Some(facts) = &plan.gpu else { return Ok((plan, None)) };
     let earlier = if resume { Journal::read(&outputs::journal_dir(&plan)) } else { None };
-    if config.run.device == Device::Auto && earlier.is_some_and(|e| e.header["placement"] != placement_json(&plan)) {
+    if config.run.device == Device::Auto && earlier.is_some_and(|e| e.header["placement"] != json!(plan.held)) {
         let without = Plan::new(config, infos, &mut || Err("the run was begun without one".into()))?;
         return Ok((without, None));
     }

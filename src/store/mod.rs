@@ -3,6 +3,7 @@
 pub mod info;
 pub mod layout;
 pub mod open;
+pub mod os;
 pub mod sink;
 pub mod source;
 pub mod spill;

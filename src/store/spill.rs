@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use memmap2::MmapRaw;
 
+use super::os;
 use crate::grid::{Region, Shape};
 use crate::{Error, Result};
 
@@ -36,7 +37,7 @@ impl Spill {
             .truncate(false)
             .open(path)
             .map_err(|e| fail("open", e))?;
-        reserve(&file, bytes.max(1) as u64).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
+        os::reserve(&file, bytes.max(1) as u64).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
         let map = MmapRaw::map_raw(&file).map_err(|e| fail("map", e))?;
         Ok(Spill { path: path.to_path_buf(), file, map, shape, planes, item })
     }
@@ -80,21 +81,6 @@ impl Spill {
         let ([nz, ny, nx], item) = (self.shape, self.item);
         let lines = Region::new(region.lo, [region.hi[0], region.hi[1], region.lo[2] + 1]);
         lines.iter().map(move |[z, y, x]| (((plane * nz + z as usize) * ny + y as usize) * nx + x as usize) * item)
-    }
-}
-
-/// Reserves room on disk, so that later writes into the mapping cannot fail for want of it.
-fn reserve(file: &File, bytes: u64) -> std::io::Result<()> {
-    if file.metadata()?.len() != bytes {
-        file.set_len(bytes)?;
-    }
-    use std::os::fd::AsRawFd;
-    // SAFETY: a valid descriptor and plain numbers.
-    match unsafe { libc::posix_fallocate(file.as_raw_fd(), 0, bytes as libc::off_t) } {
-        0 => Ok(()),
-        // File systems without the call extend sparse; the size is set already.
-        libc::EOPNOTSUPP | libc::EINVAL => Ok(()),
-        code => Err(std::io::Error::from_raw_os_error(code)),
     }
 }
 

@@ -130,6 +130,7 @@ fn hostile(shape: Shape) -> Vec<(&'static str, Voxels)> {
 fn every_channel_holds_its_tolerance_on_every_fill() {
     let Some(gpu) = adapter() else { return };
     assert!(gpu.facts().exact_floats, "this adapter's floats have been the CPU's so far");
+    assert!(gpu.facts().close_floats && gpu.probe_close().unwrap(), "and the others near to them");
     let shape = [9, 11, 37];
     for (name, volume) in hostile(shape) {
         for radius in [[0; 3], [1, 1, 1], [2, 3, 5], [0, 4, 0], [10, 10, 10]] {

@@ -3,14 +3,13 @@
 
 use std::path::Path;
 
-use occlude::gpu::GpuFacts;
 use occlude::gpu::facts::tolerance;
-use occlude::grid::Shape;
 use occlude::plan::Plan;
 use occlude::run::RunOptions;
 
-use super::adapter;
-use super::common::{Decoded, assert_same, decode, mixed_u16, parse, run_with, u16_bytes, write_npy};
+use super::common::{Decoded, assert_same, decode, parse, run_with};
+use super::setup::{CPU, SOFTWARE, folder, folder_of, place, plan, run_on};
+use super::{adapter, setup};
 
 const CONFIG: &str = r#"
 [run]
@@ -123,43 +122,21 @@ from = "both"
 "#;
 const LIT_OUTPUTS: [&str; 7] = ["var", "std", "least", "most", "mean", "cut", "light"];
 
-fn folder(voxels: &[u16], shape: Shape) -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
-    write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(voxels));
-    dir
-}
-
-const SOFTWARE: &str = "run.device='gpu:software'";
-
-fn run_on(dir: &Path, text: &str, sets: &[&str]) {
-    let sets: Vec<&str> = [&[SOFTWARE], sets].concat();
-    run_with(&parse(dir, text, &sets), &RunOptions { overwrite: true, ..Default::default() });
-}
-
 fn run(dir: &Path, text: &str, sets: &[&str]) -> Decoded {
-    run_on(dir, text, sets);
+    run_on(dir, text, &[&[SOFTWARE], sets].concat());
     decode(&dir.join("out/slope.zarr"))
-}
-
-fn plan(dir: &Path, text: &str) -> Plan {
-    let config = parse(dir, text, &[SOFTWARE]);
-    let infos: Vec<_> = occlude::store::open_inputs(&config).unwrap().iter().map(|s| s.info().clone()).collect();
-    let facts = GpuFacts { name: "Test".into(), software: true, most_bytes: 1 << 30, exact_floats: true };
-    Plan::new(&config, &infos, &mut || Ok(facts.clone())).unwrap()
 }
 
 /// The stages of each flow.
 fn flows(dir: &Path, text: &str) -> Vec<String> {
-    let plan = plan(dir, text);
-    let names = |s: &usize| plan.graph.steps[*s].stages.join("+");
-    plan.flows.iter().map(|f| f.steps.iter().map(names).collect::<Vec<_>>().join(" ")).collect()
+    setup::flows(&plan(dir, text, &[]))
 }
 
 #[test]
 fn a_run_keeps_means_on_the_gpu_and_shows_no_brick() {
     let Some(_) = adapter() else { return };
     let shape = [30, 40, 50];
-    let dir = folder(&mixed_u16(shape), shape);
+    let dir = folder(shape);
     for text in [CONFIG.to_string(), with_windows()] {
         assert_eq!(flows(dir.path(), &text), ["bell slope"]);
         let all = run(dir.path(), &text, &[]);
@@ -175,8 +152,8 @@ fn a_run_keeps_means_on_the_gpu_and_shows_no_brick() {
         assert_same("means come back", &all, &run(dir.path(), &read, &[]));
     }
     let all = run(dir.path(), CONFIG, &[]);
-    let cpu = folder(&mixed_u16(shape), shape);
-    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    let cpu = folder(shape);
+    run_on(cpu.path(), CONFIG, &[CPU]);
     let bound = tolerance::GRADIENT * 65535.0;
     for ((name, (_, a)), (_, b)) in all.iter().zip(decode(&cpu.path().join("out/slope.zarr")).values()) {
         let far = a.iter().zip(b).find(|(a, b)| (f64::from_bits(**a) - f64::from_bits(**b)).abs() > bound);
@@ -188,10 +165,10 @@ fn a_run_keeps_means_on_the_gpu_and_shows_no_brick() {
 fn statistics_light_and_levels_of_every_kind_equal_the_cpus() {
     let Some(_) = adapter() else { return };
     let shape = [30, 40, 50];
-    let [cpu, gpu] = [0, 1].map(|_| folder(&mixed_u16(shape), shape));
+    let [cpu, gpu] = [0, 1].map(|_| folder(shape));
     let joined = flows(gpu.path(), LIT);
     assert_eq!(joined, ["stats tf dim cut light both"]);
-    run_with(&parse(cpu.path(), LIT, &["run.device='cpu'"]), &RunOptions::default());
+    run_on(cpu.path(), LIT, &[CPU]);
     let same = |what: &str| {
         for name in LIT_OUTPUTS {
             let [a, b] = [&cpu, &gpu].map(|d| decode(&d.path().join(format!("out/{name}.zarr"))));
@@ -201,19 +178,18 @@ fn statistics_light_and_levels_of_every_kind_equal_the_cpus() {
         let [a, b] = [&cpu, &gpu].map(|d| std::fs::read(d.path().join("out/both.npy")).unwrap());
         assert!(a == b, "{what}: both.npy");
     };
-    run_on(gpu.path(), LIT, &[]);
+    run_on(gpu.path(), LIT, &[SOFTWARE]);
     same("bricks as given");
-    run_on(gpu.path(), LIT, &["run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]);
+    run_on(gpu.path(), LIT, &[SOFTWARE, "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]);
     same("a little memory");
 }
 
 #[test]
 fn plans_say_what_runs_together_and_what_comes_back() {
     let shape = [30, 40, 50];
-    let dir = folder(&mixed_u16(shape), shape);
-    let plan = plan(dir.path(), LIT);
-    let device = |name: &str| plan.placement.iter().find(|p| p.0 == name).map(|p| (p.1, p.2.as_str()));
-    assert_eq!(device("tf"), Some(("gpu", occlude::plan::flows::BESIDE)));
+    let dir = folder(shape);
+    let plan = plan(dir.path(), LIT, &[]);
+    assert_eq!(place(&plan, "tf"), ("gpu", occlude::plan::flows::BESIDE));
     assert!(plan.flows.iter().all(|f| f.steps.iter().all(|&s| plan.on_gpu(s))));
     let back = |plan: &Plan| {
         let wires = 0..plan.graph.wires.len();
@@ -224,12 +200,12 @@ fn plans_say_what_runs_together_and_what_comes_back() {
     assert_eq!(made(&plan), Vec::<String>::new(), "levels and codes only");
     let rank = "[stage.rank]\nop = \"ambient_occlusion\"\nmethod = \"exact\"\nradius = 2\ninput = \"stats.mean\"\n\
                 [output.rank]\npath = \"out/rank.zarr\"\nfrom = \"rank\"\n";
-    let read = self::plan(dir.path(), &format!("{LIT}{rank}"));
+    let read = self::plan(dir.path(), &format!("{LIT}{rank}"), &[]);
     assert_eq!(made(&read), ["stats.mean"], "a step of the CPU reads them");
     // Without anything beside it a table stays on the CPU.
     let alone = "[input.vol]\npath = \"vol.npy\"\n[stage.tf]\nop = \"transfer\"\ninput = \"vol\"\n\
                  points = [[0, 0, 0, 0, 0], [9, 1, 1, 1, 1]]\n[output.o]\npath = \"out/o.zarr\"\nfrom = \"tf.opacity\"\n";
-    let plan = self::plan(dir.path(), alone);
+    let plan = self::plan(dir.path(), alone, &[]);
     assert!(plan.flows.is_empty() && plan.placement[0].1 == "cpu");
     assert_eq!(plan.placement[0].2, occlude::plan::flows::ALONE);
 }
@@ -241,7 +217,7 @@ fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
     // One voxel in a void: far from it means are as small as f32 goes.
     let mut voxels = vec![0u16; shape.iter().product()];
     voxels[10 * 20 * 70 + 10 * 70 + 9] = 1;
-    let dir = folder(&voxels, shape);
+    let dir = folder_of(&voxels, shape);
     let narrow = ["stage.bell.sigma=[0.2, 0.2, 0.2]", "run.brick=[16, 16, 16]"];
     let all = run(dir.path(), CONFIG, &narrow);
     assert_same("no skipping", &all, &{
@@ -255,20 +231,91 @@ fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
 }
 
 #[test]
-fn masks_missing_voxels_and_borders_keep_steps_apart() {
+fn missing_voxels_and_masks_of_what_is_made_keep_steps_apart() {
     let shape = [6, 7, 8];
-    let dir = folder(&mixed_u16(shape), shape);
+    let dir = folder(shape);
     for (from, to, left) in [
         ("path = \"vol.npy\"", "path = \"vol.npy\"\nnodata = 7", &["slope"][..]),
-        ("sigma = 1.5", "sigma = 1.5\nwhere = { input = \"vol\", min = 9 }", &["slope"]),
-        ("input = \"bell.mean\"", "input = \"bell.mean\"\nwhere = { input = \"vol\", min = 9 }", &["bell"]),
+        ("sigma = 1.5", "sigma = 1.5\nwhere = { input = \"vol\", min = 9 }", &["bell slope"]),
+        ("input = \"bell.mean\"", "input = \"bell.mean\"\nwhere = { input = \"vol\", min = 9 }", &["bell slope"]),
+        ("input = \"bell.mean\"", "input = \"bell.mean\"\nwhere = { input = \"bell.mean\", min = 9 }", &["bell"]),
         ("sigma = 1.5", "sigma = 1.5\nborder = \"reflect\"", &["bell slope"]),
     ] {
         let text = CONFIG.replacen(from, to, 1);
         assert_ne!(text, CONFIG);
         assert_eq!(flows(dir.path(), &text), left, "{to}");
     }
-    // Beyond the edge of the volume a window sees means that the border's rule makes of means: those come back.
+    // Beyond the edge of the volume a window sees means that the border's rule makes of means, there.
     let mirrored = with_windows().replacen("radius =", "border = \"reflect\"\nradius =", 1);
-    assert_eq!(flows(dir.path(), &mirrored), ["bell"]);
+    assert_eq!(flows(dir.path(), &mirrored), ["bell slope"]);
+    // A constant that the type cannot hold makes floats of the voxels.
+    let constant = CONFIG.replacen("sigma = 1.5", "sigma = 1.5\nborder = { constant = 0.5 }", 1);
+    assert_eq!(flows(dir.path(), &constant), ["slope"]);
+}
+
+/// Steps of every border over one input and over what is made of it.
+const BORDERS: &str = r#"
+[run]
+threads = 2
+brick = [16, 32, 32]
+[input.vol]
+path = "vol.npy"
+[stage.plain]
+op = "box"
+input = "vol"
+radius = [2, 3, 5]
+[stage.mirrored]
+op = "box"
+input = "vol"
+radius = [4, 4, 9]
+border = "reflect"
+[stage.walled]
+op = "box"
+input = "vol"
+radius = 3
+border = { constant = 900 }
+where = { input = "vol", min = 3000 }
+[stage.held]
+op = "gaussian"
+input = "vol"
+sigma = 1.2
+border = "nearest"
+[stage.sum]
+op = "combine"
+op_kind = "add"
+inputs = ["plain.mean", "mirrored.mean", "walled.max"]
+[output.sum]
+path = "out/sum.zarr"
+from = "sum"
+chunk = 8
+[output.var]
+path = "out/var.zarr"
+from = "mirrored.variance"
+reduce = "moments"
+chunk = 8
+[output.held]
+path = "out/held.zarr"
+from = "held.mean"
+chunk = 8
+"#;
+
+#[test]
+fn steps_of_every_border_run_in_one_go_and_equal_the_cpus() {
+    let shape = [30, 40, 50];
+    let [cpu, gpu] = [0, 1].map(|_| folder(shape));
+    assert_eq!(flows(gpu.path(), BORDERS), ["plain mirrored walled held sum"]);
+    let Some(_) = adapter() else { return };
+    run_on(cpu.path(), BORDERS, &[CPU]);
+    for (what, sets) in [
+        ("bricks as given", &[SOFTWARE][..]),
+        ("a little memory", &[SOFTWARE, "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]),
+    ] {
+        let report = run_on(gpu.path(), BORDERS, sets);
+        let row = report.stages.iter().find_map(|s| s.together.clone()).unwrap();
+        assert!(row.bricks > 1 && row.bricks_left == 0, "{what}: {row:?}");
+        for name in ["sum", "var", "held"] {
+            let [a, b] = [&cpu, &gpu].map(|d| decode(&d.path().join(format!("out/{name}.zarr"))));
+            assert_same(&format!("{what}: {name}"), &a, &b);
+        }
+    }
 }

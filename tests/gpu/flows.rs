@@ -2,12 +2,13 @@
 
 use occlude::brick::{Scratch, Voxels, gather};
 use occlude::gpu::Gpu;
+use occlude::gpu::extend::Beyond;
 use occlude::gpu::flow::{Flow, FlowStep, Input, Kernel, Sink};
 use occlude::gpu::levels::Pyramid;
 use occlude::gpu::points::Op;
 use occlude::gpu::slopes::Fit;
 use occlude::gpu::taps::Wanted;
-use occlude::grid::{Affine, AnyViewMut, Border, DType, Region, View, ViewMut};
+use occlude::grid::{Affine, AnyViewMut, Border, DType, Region, View, ViewMut, Voxel};
 use occlude::kernel::convert::Mapping;
 use occlude::kernel::gradient::GradientOut;
 use occlude::kernel::obscurance::{ObscuranceParams, Prepared};
@@ -34,13 +35,24 @@ fn one_by_one(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Vec<Vec<Voxels>> {
         let (src, affine) = reads[0];
         let room = |n: usize| (0..n).map(|_| Voxels::zeroed(DType::F32, flow.volume.voxels())).collect::<Vec<_>>();
         let mut cx = cx(&mut scratch);
+        let windows = matches!(step.kernel, Kernel::Gaussian { .. } | Kernel::Windows { .. });
+        let bordered = (windows && step.beyond.border != Border::Clip).then(|| {
+            let grown = flow.volume.grow(step.reach);
+            let mut padded = Voxels::zeroed(src.dtype(), grown.voxels());
+            pad(src, flow.volume, &mut padded, grown, step.beyond);
+            (padded, grown.shape())
+        });
+        let (view, at) = match &bordered {
+            Some((padded, extent)) => (padded.view(*extent), step.reach),
+            None => (src.view(shape), [0; 3]),
+        };
         let made = match &step.kernel {
             Kernel::Gaussian { sigma, wanted } => {
                 let mut out = room(2);
                 let [mean, variance] = &mut out[..] else { unreachable!() };
                 let mean = wanted.mean.then(|| mean.view_mut(shape));
                 let variance = wanted.variance.then(|| variance.view_mut(shape));
-                gpu.gaussian(src.view(shape), *sigma, affine, [0; 3], mean, variance, &mut cx).unwrap();
+                gpu.gaussian(view, *sigma, affine, at, mean, variance, &mut cx).unwrap();
                 let kept = [wanted.mean, wanted.variance];
                 out.into_iter().zip(kept).filter(|(_, k)| *k).map(|(v, _)| v).collect()
             }
@@ -48,7 +60,7 @@ fn one_by_one(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Vec<Vec<Voxels>> {
                 let half = [fit.size / 2; 3];
                 let grown = flow.volume.grow(half);
                 let mut padded = Voxels::zeroed(src.dtype(), grown.voxels());
-                pad(src, flow.volume, &mut padded, grown);
+                pad(src, flow.volume, &mut padded, grown, Beyond { border: Border::Nearest, outside: 0 });
                 let mut out = room(4);
                 let [m, z, y, x] = &mut out[..] else { unreachable!() };
                 let to = GradientOut {
@@ -68,7 +80,7 @@ fn one_by_one(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Vec<Vec<Voxels>> {
                 let outs = out.iter_mut().zip(channels);
                 let mut outs: Vec<WindowOut> =
                     outs.map(|(v, c)| WindowOut { channel: *c, dst: v.view_mut(shape) }).collect();
-                gpu.window(src.view(shape), params, [0; 3], [0; 3], &mut outs, &mut cx).unwrap();
+                gpu.window(view, params, at, [0; 3], &mut outs, &mut cx).unwrap();
                 drop(outs);
                 out
             }
@@ -91,14 +103,16 @@ fn one_by_one(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Vec<Vec<Voxels>> {
     all
 }
 
-/// Grown by the edge's voxels.
-fn pad(src: &Voxels, whole: Region, dst: &mut Voxels, grown: Region) {
+/// Grown by a border rule.
+fn pad(src: &Voxels, whole: Region, dst: &mut Voxels, grown: Region, beyond: Beyond) {
+    let bits = beyond.outside;
+    let outside = if src.dtype() == DType::F32 { f32::from_bits(bits) as f64 } else { bits as f64 };
     macro_rules! arms {
         ($($t:ident),*) => {
             match (src, dst) {
                 $((Voxels::$t(s), Voxels::$t(d)) => {
                     let (s, d) = (View::dense(s, whole.shape()), ViewMut::dense(d, grown.shape()));
-                    gather::extend(s, whole, d, grown, whole, Border::Nearest, Default::default());
+                    gather::extend(s, whole, d, grown, whole, beyond.border, Voxel::from_f64(outside));
                 })*
                 _ => unreachable!("of one type"),
             }
@@ -144,6 +158,12 @@ fn recipes(affine: Affine) -> Vec<(&'static str, Vec<FlowStep>, bool)> {
         };
         step(Kernel::Sweep(params), &[of])
     };
+    let bordered = |step: FlowStep, border: Border, outside: u32| {
+        let beyond = Beyond { border, outside };
+        FlowStep { beyond, ..step }
+    };
+    let constant = Border::Constant(0.0);
+    let wide = || step(windows([9, 2, 20], affine, &[Mean, Min, open(Method::Chebyshev)]), &source);
     let opacity = Op::Transfer { points: vec![[0.0, 0.1, 0.0, 0.0, 0.0], [150.0, 1.0, 1.0, 0.5, 0.2]], component: 1 };
     vec![
         ("a gradient of a Gaussian", vec![gaussian(false), gradient(made(0, 0), true, true, 5)], false),
@@ -153,6 +173,28 @@ fn recipes(affine: Affine) -> Vec<(&'static str, Vec<FlowStep>, bool)> {
             false,
         ),
         ("a gradient of means", vec![stats(), gradient(made(0, 0), true, false, 3)], false),
+        (
+            "every border over one source",
+            vec![
+                bordered(stats(), Border::Reflect, 0),
+                bordered(wide(), constant, 3),
+                bordered(gaussian(true), Border::Nearest, 0),
+                bordered(wide(), Border::Reflect, 0),
+                stats(),
+                point(Op::Combine(CombineKind::Add), &[made(3, 0), made(4, 0), made(1, 1)]),
+            ],
+            false,
+        ),
+        (
+            "borders of what was made",
+            vec![
+                bordered(gaussian(false), constant, 7),
+                bordered(step(windows([1, 4, 2], id, &[Std, Max, Mean]), &[made(0, 0)]), Border::Reflect, 0),
+                bordered(step(windows([0, 2, 4], id, &[Mean, Min]), &[made(1, 0)]), constant, 40.5f32.to_bits()),
+                bordered(step(windows([1, 1, 1], id, &[Max]), &[made(2, 0)]), Border::Nearest, 0),
+            ],
+            false,
+        ),
         (
             "windows of windows",
             vec![stats(), step(windows([1, 3, 0], id, &[Mean, open(Method::GaussianCdf)]), &[made(0, 0)])],
@@ -251,7 +293,7 @@ fn flows_equal_their_steps_one_by_one_wherever_the_box_lies() {
                                 cells: false,
                                 ..pyramid.clone()
                             };
-                            let expect = on_cpu(&plain, &all[*s][*c], None, shape, region);
+                            let expect = on_cpu(&plain, &all[*s][*c], None, None, shape, region);
                             let text = differs(&expect, got);
                             assert_eq!(
                                 text, None,
@@ -259,7 +301,7 @@ fn flows_equal_their_steps_one_by_one_wherever_the_box_lies() {
                             );
                         }
                         let (s, c) = wanted[0];
-                        let expect = on_cpu(&pyramid, &all[s][c], None, shape, region);
+                        let expect = on_cpu(&pyramid, &all[s][c], None, None, shape, region);
                         assert_eq!(
                             differs(&expect, &got[wanted.len()]),
                             None,

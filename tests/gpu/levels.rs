@@ -1,11 +1,12 @@
 //! Levels, conversions and steps that look at one voxel, made on the GPU, equal the CPU's bit for bit.
 
 use occlude::brick::{Scratch, Voxels, gather};
+use occlude::gpu::extend::Beyond;
 use occlude::gpu::flow::{Flow, FlowStep, Input, Kernel, Sink};
 use occlude::gpu::levels::Pyramid;
 use occlude::gpu::points::Op;
-use occlude::gpu::{Gpu, SinkOut};
-use occlude::grid::{Affine, AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
+use occlude::gpu::{Gpu, Needed, SinkOut};
+use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut};
 use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::obscurance::Prepared;
 use occlude::kernel::reduce::{Cells, Level0};
@@ -17,7 +18,7 @@ use super::common::hash;
 use super::{adapter, fills};
 
 /// f32 that break careless arithmetic: every size, NaN, infinities, zeros of both signs, subnormals, ties.
-fn hostile(shape: Shape, seed: u64) -> Voxels {
+pub fn hostile(shape: Shape, seed: u64) -> Voxels {
     let special =
         [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -0.0, 1e-42, f32::MAX, f32::MIN_POSITIVE, 0.5, -f32::MAX, 1.0];
     let value = |i: usize| {
@@ -41,6 +42,9 @@ pub fn flow_of(dtype: DType, affine: Affine, shape: Shape, steps: Vec<FlowStep>,
     Flow { dtype, affine, volume: Region::whole(shape), steps, sinks }
 }
 
+/// Windows end where the volume does.
+pub const CLIP: Beyond = Beyond { border: Border::Clip, outside: 0 };
+
 pub fn step(kernel: Kernel, inputs: &[Input]) -> FlowStep {
     let reach = match &kernel {
         Kernel::Gaussian { sigma, .. } => sigma.map(|s| (3.0 * s).ceil() as usize),
@@ -49,7 +53,7 @@ pub fn step(kernel: Kernel, inputs: &[Input]) -> FlowStep {
         Kernel::Sweep(params) => Prepared::new(params).reach(),
         Kernel::Points(_) => [0; 3],
     };
-    FlowStep { kernel, inputs: inputs.to_vec(), reach, padded: false }
+    FlowStep { kernel, inputs: inputs.to_vec(), reach, beyond: CLIP, fills: None }
 }
 
 pub fn made(step: usize, channel: usize) -> Input {
@@ -62,6 +66,11 @@ pub fn point(op: Op, inputs: &[Input]) -> FlowStep {
 
 /// What comes back of every sink, as bytes: voxels, or levels and then numbers of cells.
 pub fn results(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Option<Vec<Vec<Vec<u8>>>> {
+    results_of(gpu, flow, source, &[])
+}
+
+/// The same with masks.
+pub fn results_of(gpu: &Gpu, flow: &Flow, source: &Voxels, needed: &[Needed]) -> Option<Vec<Vec<Vec<u8>>>> {
     let extent = |s: &Sink, k: usize| s.pyramid.as_ref().map_or(s.region.shape(), |p| p.extent(k, s.region.shape()));
     let room = |s: &Sink| match &s.pyramid {
         None => vec![Voxels::zeroed(DType::F32, s.region.voxels())],
@@ -80,7 +89,7 @@ pub fn results(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Option<Vec<Vec<Vec<u8
         }
     });
     let mut outs: Vec<SinkOut> = outs.collect();
-    let done = gpu.flow(flow, source.view(flow.volume.shape()), flow.volume, &mut outs);
+    let done = gpu.flow(flow, source.view(flow.volume.shape()), flow.volume, needed, &mut outs);
     done.unwrap_or_else(|e| panic!("{e}"))?;
     drop(outs);
     let bytes = |(room, cells): (Vec<Voxels>, Vec<f64>)| {
@@ -92,7 +101,15 @@ pub fn results(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Option<Vec<Vec<Vec<u8
 }
 
 /// The levels of a channel over a box by the CPU.
-pub fn on_cpu(pyramid: &Pyramid, value: &Voxels, mean: Option<&Voxels>, shape: Shape, region: Region) -> Vec<Vec<u8>> {
+pub fn on_cpu(
+    pyramid: &Pyramid,
+    value: &Voxels,
+    mean: Option<&Voxels>,
+    needed: Option<&[u8]>,
+    shape: Shape,
+    region: Region,
+) -> Vec<Vec<u8>> {
+    assert!(needed.is_none() || region == Region::whole(shape), "masks are of the whole");
     let part = |v: &Voxels| {
         let mut out = Voxels::zeroed(v.dtype(), region.voxels());
         gather::copy_common(v.view(shape), Region::whole(shape), out.view_mut(region.shape()), region);
@@ -107,7 +124,7 @@ pub fn on_cpu(pyramid: &Pyramid, value: &Voxels, mean: Option<&Voxels>, shape: S
     for (k, halved) in pyramid.halved.iter().enumerate() {
         if k == 0 {
             let mean = mean.as_ref().map(|m| m.view(region.shape()));
-            let src = Level0 { value: value.view(region.shape()), mean, needed: None };
+            let src = Level0 { value: value.view(region.shape()), mean, needed: needed.map(|m| View::dense(m, shape)) };
             cells.first(pyramid.reduce, pyramid.std, src, *halved, &mut cx(&mut scratch));
         } else {
             std::mem::swap(&mut cells, &mut fine);
@@ -136,7 +153,7 @@ pub fn differs(cpu: &[Vec<u8>], gpu: &[Vec<u8>]) -> Option<String> {
 
 const HALVED: [[bool; 3]; 3] = [[true; 3], [false, true, true], [true, true, false]];
 
-fn pyramids(range: Option<[f64; 2]>) -> Vec<Pyramid> {
+pub fn pyramids(range: Option<[f64; 2]>) -> Vec<Pyramid> {
     let kinds = [
         (Reduce::Mean, false),
         (Reduce::Min, false),
@@ -171,7 +188,7 @@ fn levels_and_codes_of_hostile_floats_equal_the_cpus() {
                     Voxels::F32(v) => Voxels::F32(v.iter().map(|v| (*v as f64 * 2.0 + 0.0) as f32).collect()),
                     _ => unreachable!("hostile voxels are floats"),
                 };
-                let cpu = on_cpu(&pyramid, &source, mean.map(|_| &doubled), shape, whole);
+                let cpu = on_cpu(&pyramid, &source, mean.map(|_| &doubled), None, shape, whole);
                 for cap in [1 << 30, 20_000] {
                     gpu.set_cap(cap);
                     let got = results(&gpu, &flow, &source).expect("it fits").swap_remove(0);
@@ -188,7 +205,7 @@ fn the_comparison_can_fail() {
     let source = hostile(shape, 9);
     for pyramid in pyramids(Some([0.0, 1.0])) {
         let mean = Some(&source).filter(|_| pyramid.reduce == Reduce::Moments);
-        let cpu = on_cpu(&pyramid, &source, mean, shape, Region::whole(shape));
+        let cpu = on_cpu(&pyramid, &source, mean, None, shape, Region::whole(shape));
         assert_eq!(differs(&cpu, &cpu.clone()), None);
         for k in 0..cpu.len() {
             let mut other = cpu.clone();

@@ -5,6 +5,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod fits;
 mod float_windows;
 mod flow_runs;
 mod flows;
@@ -12,8 +13,10 @@ mod gaussian;
 mod gradient;
 mod levels;
 mod maps;
+mod masks;
 mod obscurance;
 mod runs;
+mod setup;
 mod windows;
 
 use std::sync::Mutex;

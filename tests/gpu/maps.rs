@@ -10,9 +10,9 @@ use occlude::kernel::Context;
 use occlude::kernel::convert::{Mapping, convert};
 use occlude::kernel::occlusion_map::{Moments, base, coarsen};
 use occlude::kernel::simd::Level;
-use occlude::run::RunOptions;
 
-use super::common::{Decoded, assert_same, decode, mixed_u16, parse, run_with, u16_bytes, write_npy};
+use super::common::{Decoded, assert_same, decode};
+use super::setup::{CPU, SOFTWARE, folder, run_on};
 use super::{adapter, fills};
 
 const DTYPES: [DType; 4] = [DType::U8, DType::I8, DType::U16, DType::I16];
@@ -47,13 +47,20 @@ fn on_cpu(volume: &Voxels, levels: &[MapLevel], affine: Affine) -> Vec<Moments> 
 
 /// The same over a brick by the device, from no more than it needs.
 fn on_gpu(gpu: &Gpu, volume: &Voxels, levels: &[MapLevel], brick: Region, affine: Affine) -> Vec<Moments> {
+    (2..=levels.len()).map(|count| last_on_gpu(gpu, volume, &levels[..count], brick, affine)).collect()
+}
+
+/// Of the last of these levels alone.
+fn last_on_gpu(gpu: &Gpu, volume: &Voxels, levels: &[MapLevel], brick: Region, affine: Affine) -> Moments {
     let job = MapJob::new(volume.dtype(), levels.to_vec()).unwrap();
     let read = job.boxes(brick)[0];
     let mut part = Voxels::zeroed(volume.dtype(), read.voxels());
     let whole = Region::whole(levels[0].shape);
     gather::copy_common(volume.view(levels[0].shape), whole, part.view_mut(read.shape()), read);
-    let made = gpu.occlusion_levels(part.view(read.shape()), read, &job, brick, affine);
-    made.unwrap_or_else(|e| panic!("{e}")).0
+    let (first, dtype, mapping) = (levels.len(), DType::F32, Mapping::KEEP);
+    let codes = MapCodes { first, moments: vec![], dtype, mapping, affine, cells: true };
+    let made = gpu.occlusion_codes(part.view(read.shape()), read, &job, brick, &codes);
+    made.unwrap_or_else(|e| panic!("{e}")).last.expect("the last level's cells are asked for")
 }
 
 /// The first cell that lies further from the CPU's than the tolerance; of two lanes' levels over the whole volume.
@@ -198,9 +205,8 @@ shard = 32
 "#;
 
 fn run(dir: &Path, sets: &[&str]) -> [Decoded; 2] {
-    let options = RunOptions { overwrite: true, ..Default::default() };
-    let report = run_with(&parse(dir, CONFIG, sets), &options);
-    let device = if sets.contains(&"run.device='cpu'") { "cpu" } else { "gpu" };
+    let report = run_on(dir, CONFIG, sets);
+    let device = if sets.contains(&CPU) { "cpu" } else { "gpu" };
     assert_eq!([&report.placement["map"], &report.placement["fine"]], [device; 2]);
     ["map", "fine"].map(|name| decode(&dir.join(format!("out/{name}.zarr"))))
 }
@@ -208,16 +214,13 @@ fn run(dir: &Path, sets: &[&str]) -> [Decoded; 2] {
 #[test]
 fn a_run_makes_maps_on_the_gpu_and_shows_no_brick() {
     let Some(_) = adapter() else { return };
-    let shape = [40, 70, 80];
-    let dir = tempfile::tempdir().unwrap();
-    write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
-    let software = "run.device='gpu:software'";
-    let cpu = run(dir.path(), &["run.device='cpu'"]);
-    let all = run(dir.path(), &[software]);
+    let dir = folder([40, 70, 80]);
+    let cpu = run(dir.path(), &[CPU]);
+    let all = run(dir.path(), &[SOFTWARE]);
     let sets: [&[&str]; 3] = [
-        &[software, "run.brick=[32, 16, 64]"],
-        &[software, "run.memory='40MiB'", "run.brick='auto'"],
-        &[software, "run.brick=[64, 96, 96]"],
+        &[SOFTWARE, "run.brick=[32, 16, 64]"],
+        &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"],
+        &[SOFTWARE, "run.brick=[64, 96, 96]"],
     ];
     for sets in sets {
         for (a, b) in all.iter().zip(run(dir.path(), sets)) {
@@ -252,7 +255,7 @@ fn codes_are_those_of_the_levels_bit_for_bit() {
                 let job = MapJob::new(dtype, list.clone()).unwrap();
                 let view = volume.view(shape);
                 gpu.set_cap(1 << 30);
-                let (moments, _) = gpu.occlusion_levels(view, brick, &job, brick, affine).unwrap();
+                let moments = on_gpu(&gpu, &volume, &list, brick, affine);
                 let mapping = Mapping { range, fill: 3.0 };
                 let codes = MapCodes { first: 2, moments: vec![1, 0], dtype: to, mapping, affine, cells: true };
                 for cap in [1 << 30, 60_000] {

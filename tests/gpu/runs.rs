@@ -7,10 +7,9 @@ use occlude::gpu::{GpuFacts, facts};
 use occlude::plan::Plan;
 use occlude::run::{RunOptions, Session, Silent};
 
-use super::adapter;
-use super::common::{
-    Decoded, assert_same, decode, metadata, mixed_u16, parse, program, run_with, u16_bytes, write_npy,
-};
+use super::common::{Decoded, assert_same, decode, metadata, parse, program, run_with};
+use super::setup::{CPU, SOFTWARE, place, run_on};
+use super::{adapter, setup};
 
 /// Steps that have a GPU kernel, steps that have none, borders, a mask, levels, bricks that are cut.
 const CONFIG: &str = r#"
@@ -136,7 +135,6 @@ chunk = 16
 shard = 32
 "#;
 const OUTPUTS: [&str; 4] = ["stats.zarr", "exact.zarr", "swept.zarr", "bleeding.zarr"];
-const SOFTWARE: &str = "run.device='gpu:software'";
 
 /// Outputs whose floats are within a tolerance only, with the bound that their values' range gives.
 const CLOSE: [(&str, f64); 6] = [
@@ -183,7 +181,7 @@ fn the_comparison_of_floats_can_fail() {
 fn floats_of_the_gpu_do_not_show_bricks() {
     let Some(_) = adapter() else { return };
     let (one, two) = (folder(), folder());
-    run_with(&parse(one.path(), CONFIG, &[SOFTWARE]), &RunOptions::default());
+    run_on(one.path(), CONFIG, &[SOFTWARE]);
     run_with(&parse(two.path(), CONFIG, &[SOFTWARE, "run.brick=[32, 16, 64]"]), &RunOptions::default());
     for (name, _) in CLOSE {
         let [a, b] = [&one, &two].map(|d| decode(&d.path().join("out").join(name)));
@@ -192,9 +190,7 @@ fn floats_of_the_gpu_do_not_show_bricks() {
 }
 
 fn folder() -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
-    let shape = [40, 50, 60];
-    write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+    let dir = setup::folder([40, 50, 60]);
     std::fs::write(dir.path().join("config.toml"), CONFIG).unwrap();
     dir
 }
@@ -211,8 +207,8 @@ fn assert_same_outputs(what: &str, a: &Path, b: &Path) {
 fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
     let Some(_) = adapter() else { return };
     let (cpu, gpu) = (folder(), folder());
-    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
-    let report = run_with(&parse(gpu.path(), CONFIG, &[SOFTWARE]), &RunOptions::default());
+    run_on(cpu.path(), CONFIG, &[CPU]);
+    let report = run_on(gpu.path(), CONFIG, &[SOFTWARE]);
     assert_same_outputs("gpu:software", cpu.path(), gpu.path());
     assert_close_outputs("gpu:software", cpu.path(), gpu.path());
     let device = |name: &str| report.stages.iter().find(|s| s.name == name).map(|s| s.device.clone());
@@ -229,15 +225,16 @@ fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
     assert_eq!(device("deviation").as_deref(), Some("gpu"));
     assert_eq!(device("exact").as_deref(), Some("cpu"));
     assert_eq!(report.placement["stats"], "gpu");
+    let why = |name: &str| report.stages.iter().find(|s| s.name == name).map(|s| s.reason.clone());
+    assert_eq!(why("exact").as_deref(), Some(facts::EXACT), "the report says why");
 }
 
 #[test]
 fn a_little_memory_cuts_bricks_on_the_device_and_changes_nothing() {
     let Some(_) = adapter() else { return };
     let (cpu, gpu) = (folder(), folder());
-    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
-    let config = parse(gpu.path(), CONFIG, &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"]);
-    run_with(&config, &RunOptions::default());
+    run_on(cpu.path(), CONFIG, &[CPU]);
+    run_on(gpu.path(), CONFIG, &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"]);
     assert_same_outputs("40 MiB", cpu.path(), gpu.path());
     assert_close_outputs("40 MiB", cpu.path(), gpu.path());
 }
@@ -246,7 +243,7 @@ fn a_little_memory_cuts_bricks_on_the_device_and_changes_nothing() {
 fn a_run_resumes_on_the_device_that_it_was_begun_on() {
     let Some(_) = adapter() else { return };
     let (cpu, gpu) = (folder(), folder());
-    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    run_on(cpu.path(), CONFIG, &[CPU]);
     let config = parse(gpu.path(), CONFIG, &[SOFTWARE]);
     let options = RunOptions { resume: true, ..Default::default() };
     let session = Session::open(&config, &options, &Silent).unwrap();
@@ -260,47 +257,37 @@ fn a_run_resumes_on_the_device_that_it_was_begun_on() {
     assert_same_outputs("resumed", cpu.path(), gpu.path());
 }
 
-/// Plans with an adapter that need not exist: the planner sees facts only.
 fn plan_with(device: &str, found: Result<GpuFacts, String>) -> occlude::Result<(Plan, usize)> {
-    let dir = folder();
-    let config = parse(dir.path(), CONFIG, &[device]);
-    let infos: Vec<_> = occlude::store::open_inputs(&config)?.iter().map(|s| s.info().clone()).collect();
-    let mut calls = 0;
-    let plan = Plan::new(&config, &infos, &mut || {
-        calls += 1;
-        found.clone()
-    })?;
-    assert!(calls <= 1);
-    Ok((plan, calls))
+    setup::plan_with(folder().path(), CONFIG, &[device], found)
 }
 
 #[test]
 fn placement_follows_the_device_and_says_why() {
-    let found = |software| GpuFacts { name: "Test 9000".into(), software, most_bytes: 1 << 30, exact_floats: software };
+    let found = |software| GpuFacts { software, exact_floats: software, ..setup::found() };
     let none = || Err("looked for a driver; found no Vulkan adapter".to_string());
-    let on = |plan: &Plan, name: &str| {
-        let place = plan.placement.iter().find(|p| p.0 == name).unwrap();
-        (place.1, place.2.clone())
-    };
     let (plan, calls) = plan_with("run.device='cpu'", Ok(found(false))).unwrap();
     assert_eq!((calls, plan.gpu.is_none()), (0, true));
     let parked = plan.groups[0].brick.parked;
     let (plan, _) = plan_with("run.device='auto'", Ok(found(false))).unwrap();
-    assert_eq!(on(&plan, "stats"), ("gpu", "Test 9000".into()));
-    assert_eq!(on(&plan, "swept"), ("gpu", "Test 9000".into()));
-    assert_eq!(on(&plan, "bell"), ("cpu", facts::INEXACT.into()));
-    assert_eq!(on(&plan, "bells"), ("cpu", facts::INEXACT.into()));
-    assert_eq!(on(&plan, "bleeding"), ("cpu", facts::NORMALS.into()));
-    assert_eq!(on(&plan, "again"), ("cpu", facts::INEXACT.into()));
-    assert!(on(&plan, "exact").1.contains("exact"));
+    assert_eq!(place(&plan, "stats"), ("gpu", "Test 9000"));
+    assert_eq!(place(&plan, "swept"), ("gpu", "Test 9000"));
+    assert_eq!(place(&plan, "bell"), ("cpu", facts::INEXACT));
+    assert_eq!(place(&plan, "bells"), ("cpu", facts::INEXACT));
+    assert_eq!(place(&plan, "bleeding"), ("cpu", facts::NORMALS));
+    assert_eq!(place(&plan, "again"), ("cpu", facts::INEXACT));
+    assert!(place(&plan, "exact").1.contains("exact"));
     let staging = plan.groups[0].brick.parked - parked;
+    let rough = GpuFacts { close_floats: false, ..setup::found() };
+    let (plan, _) = plan_with("run.device='auto'", Ok(rough)).unwrap();
+    assert_eq!(["mirrored", "again", "slope", "steps"].map(|s| place(&plan, s)), [("cpu", facts::ROUGH); 4]);
+    assert_eq!(["stats", "swept", "bell", "deviation"].map(|s| place(&plan, s).0), ["gpu"; 4]);
     let (plan, _) = plan_with("run.device='gpu:software'", Ok(found(true))).unwrap();
-    assert_eq!(on(&plan, "bell"), ("gpu", "Test 9000".into()));
-    assert_eq!(on(&plan, "again"), ("gpu", "Test 9000".into()));
+    assert_eq!(place(&plan, "bell"), ("gpu", "Test 9000"));
+    assert_eq!(place(&plan, "again"), ("gpu", "Test 9000"));
     assert!(staging > 0 && plan.groups[0].brick.parked - parked > staging, "device memory of software counts");
     let (plan, _) = plan_with("run.device='auto'", none()).unwrap();
     assert!(plan.placement.iter().all(|p| p.1 == "cpu"));
-    assert!(on(&plan, "stats").1.contains("no Vulkan adapter"));
+    assert!(place(&plan, "stats").1.contains("no Vulkan adapter"));
     for device in ["gpu", "gpu:software"] {
         let error = plan_with(&format!("run.device='{device}'"), none()).unwrap_err();
         assert_eq!(error.exit_code(), 1);
@@ -342,10 +329,9 @@ fn many_workers_share_bricks_between_the_lanes() {
     let Some(_) = adapter() else { return };
     let (cpu, pure, mixed) = (folder(), folder(), folder());
     let bricks = "run.brick=[8, 16, 32]";
-    run_with(&parse(cpu.path(), CONFIG, &["run.device='cpu'"]), &RunOptions::default());
+    run_on(cpu.path(), CONFIG, &[CPU]);
     let run = |dir: &Path, sets: &[&str]| {
-        let config = parse(dir, CONFIG, &[&[SOFTWARE, bricks, "run.threads=8"], sets].concat());
-        let report = run_with(&config, &RunOptions::default());
+        let report = run_on(dir, CONFIG, &[&[SOFTWARE, bricks, "run.threads=8"], sets].concat());
         let on_cpu = |name: &str| report.stages.iter().find(|s| s.name == name).map_or(0, |s| s.bricks_on_cpu);
         (report.byte_identity_waived, ["swept", "floats", "stats", "mirrored", "bell"].map(on_cpu))
     };
@@ -365,8 +351,7 @@ fn many_workers_share_bricks_between_the_lanes() {
 
 #[test]
 fn workers_fill_the_ring_and_its_staging_is_counted() {
-    let facts = GpuFacts { name: "Test 9000".into(), software: false, most_bytes: 1 << 30, exact_floats: true };
-    let (plan, _) = plan_with("run.device='auto'", Ok(facts)).unwrap();
+    let (plan, _) = plan_with("run.device='auto'", Ok(setup::found())).unwrap();
     assert!(facts::SLOTS >= 3 && plan.threads == 2 && plan.workers == facts::SLOTS as usize);
     assert!(plan.groups[0].brick.in_flight as u64 > facts::SLOTS);
     assert!(plan.groups[0].brick.parked as usize > 3 * 40 * 50 * 60 / 8, "three bricks' voxels and sums");
@@ -414,12 +399,7 @@ shard = [8, 8, 64]
 #[test]
 fn a_device_lost_in_a_run_is_opened_anew_or_ends_it_resumable() {
     let Some(_) = adapter() else { return };
-    let long = || {
-        let dir = tempfile::tempdir().unwrap();
-        let shape = [7, 8, 1100];
-        write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
-        dir
-    };
+    let long = || setup::folder([7, 8, 1100]);
     let same = |what: &str, a: &Path, b: &Path| {
         for name in ["stats.zarr", "swept.zarr", "bell.zarr"] {
             let [a, b] = [a, b].map(|d| decode(&d.join("out").join(name)));
@@ -427,7 +407,7 @@ fn a_device_lost_in_a_run_is_opened_anew_or_ends_it_resumable() {
         }
     };
     let (cpu, once, twice) = (long(), long(), long());
-    run_with(&parse(cpu.path(), LONG, &["run.device='cpu'"]), &RunOptions::default());
+    run_on(cpu.path(), LONG, &[CPU]);
     let options = RunOptions { resume: true, ..Default::default() };
     let config = parse(once.path(), LONG, &[SOFTWARE]);
     let session = Session::open(&config, &options, &Silent).unwrap();

@@ -2,7 +2,6 @@
 
 use std::fs::File;
 use std::io::Write;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -24,6 +23,7 @@ use crate::plan::lengths;
 use crate::run::Cancel;
 use crate::stage::{DirectionSet, DirectionWeights, GradientWeight, Method};
 use crate::store::open_inputs;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// Directions of the truth of a sweep.

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use super::super::os;
 use super::{Sink, files};
 use crate::{Error, Result};
 
@@ -21,7 +21,7 @@ impl Claim {
     /// another run has claimed it.
     pub fn existing(path: &Path) -> std::result::Result<Option<Claim>, PathBuf> {
         let dir = Sink::work_dir(path);
-        let Ok(file) = File::open(&dir) else { return Ok(None) };
+        let Ok(file) = os::open_folder(&dir) else { return Ok(None) };
         match file.try_lock() {
             Err(TryLockError::WouldBlock) => Err(dir),
             Ok(()) | Err(TryLockError::Error(_)) => Ok(Some(Claim { dir, file })),
@@ -45,9 +45,7 @@ impl Claim {
 
     /// Whether the folder under that name is still the one that was claimed: `--overwrite` removes it.
     pub fn holds(&self) -> bool {
-        let place = |meta: std::io::Result<fs::Metadata>| meta.ok().map(|m| (m.dev(), m.ino()));
-        let mine = place(self.file.metadata());
-        mine.is_some() && mine == place(fs::metadata(&self.dir))
+        os::is_at(&self.file, &self.dir)
     }
 }
 

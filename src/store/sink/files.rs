@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use crate::store::os;
 use crate::{Error, Result};
 
 /// The error of writing what will be `path`; a full disk is named as such.
@@ -29,37 +30,27 @@ const SINGLE_SYNCS: usize = 3;
 /// Makes entries of folders (new names, renames) durable.
 pub fn sync_dirs(dirs: &BTreeSet<PathBuf>) -> Result<()> {
     let or_here = |dir: &PathBuf| if dir.as_os_str().is_empty() { PathBuf::from(".") } else { dir.clone() };
-    let sync = |dir: PathBuf| File::open(&dir).and_then(|d| d.sync_all()).map_err(|e| cannot_write(&dir, e));
-    match dirs.first() {
-        Some(first) if dirs.len() > SINGLE_SYNCS => sync_everything(&or_here(first)),
-        _ => dirs.iter().map(or_here).try_for_each(sync),
+    if let Some(first) = dirs.first().filter(|_| dirs.len() > SINGLE_SYNCS)
+        && sync_everything(&or_here(first))?
+    {
+        return Ok(());
     }
+    dirs.iter().map(or_here).try_for_each(|dir| os::sync_dir(&dir).map_err(|e| cannot_write(&dir, e)))
 }
 
 /// Makes files durable; `path_of(i)` is the name for errors.
 pub fn sync_files(files: &[Arc<File>], path_of: impl Fn(usize) -> PathBuf) -> Result<()> {
-    if files.len() > SINGLE_SYNCS {
-        return sync_everything(&path_of(0));
+    if files.len() > SINGLE_SYNCS && sync_everything(&path_of(0))? {
+        return Ok(());
     }
     files.iter().enumerate().try_for_each(|(i, f)| f.sync_data().map_err(|e| cannot_write(&path_of(i), e)))
 }
 
-/// Makes all that was written to the file system of `path` (or of the nearest folder above that exists) durable.
-fn sync_everything(path: &Path) -> Result<()> {
+/// Makes all that was written to the file system of `path` (or of the nearest folder above that exists) durable; false where
+/// the system has no such call.
+fn sync_everything(path: &Path) -> Result<bool> {
     let dir = path.ancestors().find(|p| p.is_dir()).unwrap_or(Path::new("."));
-    let file = File::open(dir).map_err(|e| cannot_write(dir, e))?;
-    #[cfg(target_os = "linux")]
-    // SAFETY: the descriptor is open.
-    if unsafe { libc::syncfs(std::os::fd::AsRawFd::as_raw_fd(&file)) } != 0 {
-        return Err(cannot_write(path, io::Error::last_os_error()));
-    }
-    #[cfg(not(target_os = "linux"))]
-    // SAFETY: takes nothing and cannot fail.
-    unsafe {
-        libc::sync()
-    };
-    drop(file);
-    Ok(())
+    os::sync_file_system(dir).map_err(|e| cannot_write(path, e))
 }
 
 /// Makes a folder and those above it; adds the folders that got new entries to `changed`.

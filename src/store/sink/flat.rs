@@ -4,7 +4,6 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::Read;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
@@ -15,6 +14,7 @@ use super::files::{Temps, cannot_write, sync_dirs};
 use super::header::header;
 use super::{Encoded, SinkSpec};
 use crate::grid::Region;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// Bytes at each end of a file that [`fingerprint`] reads.

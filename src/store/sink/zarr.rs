@@ -6,7 +6,6 @@
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::fs::{File, OpenOptions};
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard};
 
@@ -16,6 +15,7 @@ use super::files::{Temps, cannot_write, sync_dirs, sync_files};
 use super::{Encoded, SinkSpec, metadata};
 use crate::config::OutputFormat;
 use crate::grid::Region;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// File handles kept open at once: more shards than that are reopened as needed, so that limits of the system (often

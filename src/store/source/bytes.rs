@@ -4,9 +4,10 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use memmap2::{Mmap, UncheckedAdvice};
+use memmap2::Mmap;
 
 use crate::brick::Voxels;
+use crate::store::os;
 use crate::{Error, Result};
 
 /// A whole file, mapped for reading.
@@ -51,10 +52,7 @@ impl MappedFile {
         const PAGE: u64 = 1 << 16; // a multiple of every page size in use
         let (start, end) = (start.div_ceil(PAGE) * PAGE, end.min(self.len()) / PAGE * PAGE);
         if end > start {
-            // SAFETY: the map is read-only and backed by its file, so dropped pages come back with the same bytes.
-            let _ = unsafe {
-                self.map.unchecked_advise_range(UncheckedAdvice::DontNeed, start as usize, (end - start) as usize)
-            };
+            os::forget(&self.map, start as usize, (end - start) as usize);
         }
     }
 }
@@ -127,19 +125,4 @@ pub fn head(path: &Path, reader: &mut dyn Read, most: usize) -> Result<Vec<u8>> 
 /// Up to `most` bytes from the start of a file.
 pub fn file_head(path: &Path, most: usize) -> Result<Vec<u8>> {
     head(path, &mut open_file(path)?, most)
-}
-
-/// Bytes free for this user on the disk of `folder`; `None` where the system cannot say.
-pub fn free_bytes(folder: &Path) -> Option<u64> {
-    use std::os::unix::ffi::OsStrExt;
-    let path = std::ffi::CString::new(folder.as_os_str().as_bytes()).ok()?;
-    // SAFETY: `statvfs` is plain numbers, for which all zeros is a value; the path is NUL-terminated and the struct
-    // outlives the call.
-    let (code, stat) = unsafe {
-        let mut stat: libc::statvfs = std::mem::zeroed();
-        (libc::statvfs(path.as_ptr(), &mut stat), stat)
-    };
-    #[allow(clippy::unnecessary_cast)] // other systems have other widths here
-    let free = (stat.f_bavail as u64).saturating_mul(stat.f_frsize as u64);
-    (code == 0).then_some(free)
 }

@@ -5,7 +5,6 @@
 //! again: measured on 512 planes of 1024^2 u16 (zstd, budget 256 MiB, window radius 10), some 40 times.
 
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::path::Path;
 
 use super::bytes::{Files, MappedFile};
@@ -15,6 +14,7 @@ use super::zarr::ZarrArray;
 use super::{ChunkRead, VolumeInfo};
 use crate::brick::Voxels;
 use crate::grid::{Region, Shape};
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// Planes of a brick and its halo, for weighing a stack of chunks against the budget.

@@ -1,13 +1,13 @@
 //! What makes an input the same input: facts that do not depend on where it lies.
 
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
 use super::bytes;
 use super::zarr::ZarrArray;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 const SAMPLES: u64 = 16;

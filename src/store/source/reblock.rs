@@ -1,12 +1,12 @@
 //! Compressed or tiled TIFF pages, decoded once into plain planes in scratch.
 
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use super::spool::{Progress, nameless};
 use super::tiff::{MOST_CHUNK, Reader, broken, reader};
 use crate::grid::DType;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// Pages to decode, in the order of the planes that they become (native byte order).

@@ -2,11 +2,11 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use super::zarr_meta::ShardMeta;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// An open shard: its file and its index.

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 
 use super::bytes;
+use crate::store::os;
 use crate::{Error, Result};
 
 /// How a stream of voxels is packed.
@@ -142,7 +143,7 @@ impl Packed {
 
 /// A file without a name in `scratch`, after a check that `len` bytes have room there.
 pub fn nameless(scratch: &Path, len: u64) -> Result<File> {
-    if let Some(free) = bytes::free_bytes(scratch).filter(|free| *free < len) {
+    if let Some(free) = os::free_bytes(scratch).filter(|free| *free < len) {
         return Err(Error::file(
             scratch,
             format!(

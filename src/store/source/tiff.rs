@@ -2,7 +2,6 @@
 
 use std::fs::File;
 use std::io::BufReader;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use tiff::decoder::{Decoder, Limits};
@@ -17,6 +16,7 @@ use super::tiff_text::{Described, Order, describe};
 use crate::config::Input;
 use crate::grid::DType;
 use crate::store::VolumeInfo;
+use crate::store::os::FileExt;
 use crate::{Error, Result};
 
 /// Bytes of the shortest directory of a page with voxels (its width, height and strips); more pages than these fit into

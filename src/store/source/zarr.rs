@@ -3,7 +3,6 @@
 use std::borrow::Cow;
 use std::fs::File;
 use std::num::NonZeroU64;
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -21,6 +20,7 @@ use crate::brick::Voxels;
 use crate::config::Input;
 use crate::grid::{Region, Voxel};
 use crate::store::VolumeInfo;
+use crate::store::os::FileExt;
 use crate::{Error, Result, with_dtype};
 
 /// An open Zarr array.
