@@ -147,6 +147,8 @@ fn lines_without_needed_voxels_are_not_searched_and_counted() {
                 max_distance = 20\nwhere = { input = 'a', iso = [1], band = 2.0 }\n[output.o]\npath = 'o.zarr'\nfrom = 's'\n\
                 dtype = 'f32'\n";
     let report = run(dir.path(), text, &[]);
+    let core = report.stages[0].core_seconds.expect("a stage on the CPU");
+    assert!(core > 0.0, "{core}");
     let lines = &report.stages[0].lines;
     assert!(lines["where"] > 0, "{lines:?}");
     assert!(lines["where"] + lines["open"] < lines["total"], "{lines:?}");

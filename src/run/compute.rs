@@ -1,9 +1,9 @@
 //! Evaluates a program on a loaded brick, step by step, giving buffers back as soon as nobody reads them.
 
 use std::cell::Cell;
-use std::time::Instant;
 
 use super::flows::Ready;
+use super::metrics::Since;
 use super::program::Program;
 use super::read::{Loaded, Reader};
 use super::steps::{Engine, MaskValue};
@@ -63,19 +63,19 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
     for (at, &s) in program.steps.iter().enumerate() {
         let step = &plan.graph.steps[s];
         if let Some(flow) = program.flow_at(s) {
-            let start = Instant::now();
+            let since = Since::now();
             if let Some(done) = engine.flow(program, flow, &mut values, &masks, &needed, brick)? {
                 ran = true;
                 let voxels = |t| program.step_box(plan, t, brick).voxels() as u64;
                 match flow.steps[..] {
-                    [only] => metrics.step(only, start, voxels(only)),
+                    [only] => metrics.step(only, since, voxels(only)),
                     _ => {
-                        metrics.flow(plan.flow_of(s).unwrap_or_default(), start, brick.voxels() as u64);
+                        metrics.flow(plan.flow_of(s).unwrap_or_default(), since.clock, brick.voxels() as u64);
                         done.steps.iter().for_each(|&t| metrics.step_in_flow(t, voxels(t)));
                     }
                 }
                 let names: Vec<String> = done.steps.iter().flat_map(|t| plan.graph.steps[*t].stages.clone()).collect();
-                trace.span(&names.join("+"), start, &[("brick", format!("{brick:?}"))]);
+                trace.span(&names.join("+"), since.clock, &[("brick", format!("{brick:?}"))]);
                 made.extend(done.steps);
                 ready.extend(done.ready);
                 done.values.into_iter().for_each(|(w, value)| values[w] = Some(value));
@@ -96,7 +96,7 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
             masks.push((s, engine.mask(mask, value, region, volume)));
         }
         let known = masks.iter().find(|(m, _)| *m == s).map_or(&MaskValue::All, |(_, m)| m);
-        let start = Instant::now();
+        let since = Since::now();
         let outputs = if off.contains(&s) {
             engine.filled(step, region)
         } else {
@@ -108,8 +108,8 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
             constant = true;
         } else {
             ran = true;
-            metrics.step(s, start, region.voxels() as u64);
-            trace.span(&step.stages.join("+"), start, &[("brick", format!("{brick:?}"))]);
+            metrics.step(s, since, region.voxels() as u64);
+            trace.span(&step.stages.join("+"), since.clock, &[("brick", format!("{brick:?}"))]);
         }
         keep(engine, program, step, outputs, &needed, at, &mut values);
     }

@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::kernel::obscurance::LineCounts;
+use crate::store::os;
 
 /// Counters that all threads add to.
 #[derive(Debug)]
@@ -21,8 +22,7 @@ pub struct Metrics {
     bricks_resumed: AtomicU64,
     skipped: Mutex<BTreeMap<&'static str, u64>>,
     waits: Mutex<BTreeMap<&'static str, f64>>,
-    /// Nanoseconds and voxels per step.
-    steps: Vec<(AtomicU64, AtomicU64)>,
+    steps: Vec<StepCounters>,
     /// Lines of sweeps per step: all, those without a needed voxel, those that nothing can occlude.
     lines: Vec<[AtomicU64; 3]>,
     /// Bricks per step that the GPU left to the CPU.
@@ -33,6 +33,43 @@ pub struct Metrics {
     pub read_ns: AtomicU64,
     pub encode_ns: AtomicU64,
     peak: AtomicU64,
+}
+
+#[derive(Debug, Default)]
+struct StepCounters {
+    ns: AtomicU64,
+    /// Of those, with a core.
+    core_ns: AtomicU64,
+    voxels: AtomicU64,
+}
+
+/// What a step did.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct StepTotals {
+    /// Summed over threads.
+    pub seconds: f64,
+    /// Of those, with a core: what others on the machine take does not count.
+    pub core_seconds: f64,
+    pub voxels: u64,
+}
+
+/// Since when a thread has been at something, by the clock and by the time that it has had a core.
+#[derive(Debug, Clone, Copy)]
+pub struct Since {
+    pub clock: Instant,
+    core: Option<Duration>,
+}
+
+impl Since {
+    pub fn now() -> Since {
+        Since { clock: Instant::now(), core: os::thread_time() }
+    }
+
+    /// Seconds with a core; by the clock where the system does not say.
+    fn core_time(&self) -> Duration {
+        let taken = self.core.and_then(|from| os::thread_time()?.checked_sub(from));
+        taken.unwrap_or_else(|| self.clock.elapsed())
+    }
 }
 
 #[derive(Debug, Default)]
@@ -122,14 +159,16 @@ impl Metrics {
         *self.waits.lock().unwrap_or_else(|e| e.into_inner()).entry(cause).or_default() += seconds;
     }
 
-    pub fn step(&self, step: usize, start: Instant, voxels: u64) {
-        self.steps[step].0.fetch_add(start.elapsed().as_nanos() as u64, Relaxed);
-        self.steps[step].1.fetch_add(voxels, Relaxed);
+    pub fn step(&self, step: usize, since: Since, voxels: u64) {
+        let to = &self.steps[step];
+        to.ns.fetch_add(since.clock.elapsed().as_nanos() as u64, Relaxed);
+        to.core_ns.fetch_add(since.core_time().as_nanos() as u64, Relaxed);
+        to.voxels.fetch_add(voxels, Relaxed);
     }
 
     /// A step made voxels as part of a flow, which has the time.
     pub fn step_in_flow(&self, step: usize, voxels: u64) {
-        self.steps[step].1.fetch_add(voxels, Relaxed);
+        self.steps[step].voxels.fetch_add(voxels, Relaxed);
     }
 
     /// A flow made a brick.
@@ -178,8 +217,10 @@ impl Metrics {
     }
 
     /// Seconds in a step's kernels (summed over threads) and voxels that it made, halos included.
-    pub fn step_totals(&self, step: usize) -> (f64, u64) {
-        (self.steps[step].0.load(Relaxed) as f64 * 1e-9, self.steps[step].1.load(Relaxed))
+    pub fn step_totals(&self, step: usize) -> StepTotals {
+        let StepCounters { ns, core_ns, voxels } = &self.steps[step];
+        let [ns, core_ns, voxels] = [ns, core_ns, voxels].map(|n| n.load(Relaxed));
+        StepTotals { seconds: ns as f64 * 1e-9, core_seconds: core_ns as f64 * 1e-9, voxels }
     }
 
     /// Takes in what a pre-pass counted, except its bricks.
@@ -188,8 +229,9 @@ impl Metrics {
         self.read_ns.fetch_add(other.read_ns.load(Relaxed), Relaxed);
         self.peak.fetch_max(other.peak.load(Relaxed), Relaxed);
         for (mine, theirs) in self.steps.iter().zip(&other.steps) {
-            mine.0.fetch_add(theirs.0.load(Relaxed), Relaxed);
-            mine.1.fetch_add(theirs.1.load(Relaxed), Relaxed);
+            mine.ns.fetch_add(theirs.ns.load(Relaxed), Relaxed);
+            mine.core_ns.fetch_add(theirs.core_ns.load(Relaxed), Relaxed);
+            mine.voxels.fetch_add(theirs.voxels.load(Relaxed), Relaxed);
         }
     }
 

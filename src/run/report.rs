@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::metrics::{FlowTotals, Metrics};
+use super::metrics::{FlowTotals, Metrics, StepTotals};
 use crate::plan::Plan;
 use crate::plan::graph::StepId;
 
@@ -47,6 +47,9 @@ pub struct StageReport {
     pub name: String,
     /// Time in its kernels, summed over threads.
     pub seconds: f64,
+    /// Of a stage on the CPU: how much of that its threads had a core. The rest they waited for one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub core_seconds: Option<f64>,
     pub device: String,
     /// Why it ran there.
     pub reason: String,
@@ -82,11 +85,12 @@ pub(super) fn stages(plan: &Plan, metrics: &Metrics) -> Vec<StageReport> {
 }
 
 fn stage(plan: &Plan, metrics: &Metrics, s: StepId) -> StageReport {
-    let (seconds, voxels) = metrics.step_totals(s);
+    let StepTotals { seconds, core_seconds, voxels } = metrics.step_totals(s);
     let (_, device, reason) = &plan.placement[s];
     StageReport {
         name: plan.graph.steps[s].stages.join("+"),
         seconds,
+        core_seconds: (*device == "cpu").then_some(core_seconds),
         device: device.to_string(),
         reason: reason.clone(),
         voxels,

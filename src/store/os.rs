@@ -4,6 +4,7 @@
 use std::fs::File;
 use std::io;
 use std::path::Path;
+use std::time::Duration;
 
 #[cfg(unix)]
 pub use std::os::unix::fs::FileExt;
@@ -76,6 +77,21 @@ pub fn is_at(open: &File, folder: &Path) -> bool {
         let _ = open;
         folder.is_dir()
     }
+}
+
+/// Time that this thread has had a core; `None` where the system does not say.
+pub fn thread_time() -> Option<Duration> {
+    #[cfg(unix)]
+    {
+        // SAFETY: `timespec` is plain numbers, for which all zeros is a value, and outlives the call.
+        let (code, t) = unsafe {
+            let mut t: libc::timespec = std::mem::zeroed();
+            (libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t), t)
+        };
+        (code == 0).then(|| Duration::new(t.tv_sec as u64, t.tv_nsec as u32))
+    }
+    #[cfg(not(unix))]
+    None
 }
 
 /// Bytes free for this user on the disk of `folder`; `None` where the system cannot say.

@@ -246,15 +246,19 @@ impl<T: Coded> Job<'_, T> {
         }
         let mut before = None;
         for (x, open) in open.iter_mut().enumerate() {
-            let (v, code) = (values[x], usize::from(codes[x]));
-            let settled = gone(v, rule.missing) || infinite(v.to_f64(), rule.stored.flipped).is_some();
-            // Between two levels there may be one value or many.
-            if !settled && counts.high[x] - counts.low[x] == counts.n[x] && !rule.stored.steps(code) {
-                let known = before.filter(|(at, w)| at + 1 == x && *w == v).is_some();
-                if self.uniform([z, y, x], v, known) {
-                    *open = R::from_f64(if rule.ties == Ties::Le { 1.0 } else { 0.5 });
-                    before = Some((x, v));
-                }
+            // Between two levels there may be one value or many; where none lies between, the count is exact.
+            let between = counts.high[x].wrapping_sub(counts.low[x]) == counts.n[x];
+            if !between || rule.stored.steps(usize::from(codes[x])) {
+                continue;
+            }
+            let v = values[x];
+            if gone(v, rule.missing) || infinite(v.to_f64(), rule.stored.flipped).is_some() {
+                continue;
+            }
+            let known = before.filter(|(at, w)| at + 1 == x && *w == v).is_some();
+            if self.uniform([z, y, x], v, known) {
+                *open = R::from_f64(if rule.ties == Ties::Le { 1.0 } else { 0.5 });
+                before = Some((x, v));
             }
         }
     }

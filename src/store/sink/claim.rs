@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
-use super::super::os;
 use super::{Sink, files};
+use crate::store::os;
 use crate::{Error, Result};
 
 /// An output that no other run may write while this lives.
