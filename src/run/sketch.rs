@@ -7,8 +7,8 @@ use std::sync::Mutex;
 use super::compute::Finished;
 use super::value::Comp;
 use crate::grid::hash::mix;
-use crate::grid::{DType, Region, Shape, View, Voxel};
-use crate::kernel::levels::{Levels, MOST_LEVELS};
+use crate::grid::{DType, Region, Shape, View};
+use crate::kernel::levels::{Coded, Levels, MOST_LEVELS};
 use crate::plan::Plan;
 use crate::plan::graph::WireId;
 
@@ -103,15 +103,13 @@ impl Sketch {
         }
     }
 
-    fn voxels<T: Voxel>(&self, view: View<T>, missing: Option<i64>, brick: Region, part: &mut Found) {
+    fn voxels<T: Coded>(&self, view: View<T>, missing: Option<i64>, brick: Region, part: &mut Found) {
         let counts_for = |v: f64| v.is_finite() && missing.is_none_or(|m| m as f64 != v);
         let first = self.dtype.range().0;
         for (z, y) in (0..view.shape[0]).flat_map(|z| (0..view.shape[1]).map(move |y| (z, y))) {
             let row = view.row_at(z, y);
             match part {
-                Found::Counts(counts) => {
-                    row.iter().for_each(|v| counts[(v.to_f64() - first) as usize] += 1);
-                }
+                Found::Counts(counts) => tally(row, counts),
                 Found::Sample { few, least, most, sample } => {
                     for v in row.iter().map(|v| v.to_f64() + 0.0).filter(|v| counts_for(*v)) {
                         (*least, *most) = (least.min(v), most.max(v));
@@ -163,6 +161,21 @@ impl Sketch {
         }
         levels
     }
+}
+
+/// Counts the values of a row. Four equal ones at once: a background is the same count again and again, each add of which waits for
+/// the one before.
+fn tally<T: Coded>(row: &[T], counts: &mut [u64]) {
+    let (fours, rest) = row.as_chunks::<4>();
+    for four in fours {
+        let [a, b, c, d] = four.map(Coded::place);
+        if a == b && b == c && c == d {
+            counts[a] += 4;
+        } else {
+            [a, b, c, d].into_iter().for_each(|place| counts[place] += 1);
+        }
+    }
+    rest.iter().for_each(|v| counts[v.place()] += 1);
 }
 
 /// The next smaller number of a type.

@@ -12,9 +12,9 @@ use crate::multiversion;
 pub(crate) trait Coded: Voxel {
     /// As wide as the voxel, so that a comparison's result needs no widening.
     type Count: Copy + Default + std::ops::AddAssign + From<bool> + Into<u64>;
-    /// Values of the type, where a table of their codes is the faster way.
+    /// Values of the type, where it has at most 16 bits; else 0.
     const VALUES: usize;
-    /// Place in that table, ascending with the value.
+    /// Place among them, ascending with the value.
     fn place(self) -> usize;
     /// Writes the codes of a row by a search in registers; false where there is none (see [`search`]).
     fn search(_level: Level, _row: &[Self], _levels: &[Self], _flipped: bool, _codes: &mut [u8]) -> bool {

@@ -11,6 +11,7 @@ pub(crate) mod sums;
 mod vector;
 
 pub use choose::{Levels, PARTS};
+pub(crate) use codes::Coded;
 
 use std::ops::Range;
 
@@ -21,7 +22,7 @@ use crate::brick::scratch::{cut, padded};
 use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{Ties, WindowParams};
 use crate::{with_dtype, with_view};
-use codes::{Coded, Seen, Stored, fill_codes, gone};
+use codes::{Seen, Stored, fill_codes, gone};
 use counts::{All, Counts, Lanes, count_row};
 use slopes::{Slopes, interpolate};
 use sums::{NEVER, RUN, Sum, Tile, Windows, Work, sweep};
