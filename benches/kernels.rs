@@ -98,10 +98,7 @@ fn check(dtype: DType, channels: &[WindowChannel], coded: bool, p: &WindowParams
 
 /// Processor time of this thread in seconds: neighbours on a shared machine disturb it less than the wall clock.
 fn clock() -> f64 {
-    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: `t` is a valid place for the result.
-    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
-    t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
+    occlude::store::os::thread_time().expect("a thread clock").as_secs_f64()
 }
 
 /// Best of several runs, in seconds.

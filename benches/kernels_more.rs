@@ -60,11 +60,7 @@ fn main() {
 
 /// Seconds of CPU time that this thread has used: neighbours on the machine count less.
 fn thread_seconds() -> f64 {
-    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: `t` is a valid timespec, and the clock exists on every Linux.
-    let failed = unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
-    assert_eq!(failed, 0, "no thread clock");
-    t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
+    occlude::store::os::thread_time().expect("a thread clock").as_secs_f64()
 }
 
 /// Least seconds of several runs.

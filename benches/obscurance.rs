@@ -29,10 +29,7 @@ fn params() -> ObscuranceParams {
 
 /// Seconds that this thread has computed: other users of the machine do not count.
 fn cpu_seconds() -> f64 {
-    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: `t` is a valid timespec.
-    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
-    t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
+    occlude::store::os::thread_time().expect("a thread clock").as_secs_f64()
 }
 
 fn hash(p: [i64; 3]) -> u64 {

@@ -24,7 +24,7 @@ pub(super) struct Lanes {
     first: usize,
     all: All,
     /// Codes of the sweep, where there is another one.
-    part: Option<Range<usize>>,
+    pub part: Option<Range<usize>>,
 }
 
 impl Lanes {
@@ -42,10 +42,6 @@ impl Lanes {
             true => NEVER - 1,
             false => (self.first + k) as u8,
         })
-    }
-
-    pub fn part(&self) -> Option<Range<usize>> {
-        self.part.clone()
     }
 }
 

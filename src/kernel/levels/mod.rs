@@ -60,7 +60,7 @@ pub fn levels(
     let radius: [usize; 3] = std::array::from_fn(|a| params.radius[a].min(from[a] - 1));
     with_view!(AnyView, src, v => {
         let rule = Rule::new(levels, params, ties);
-        let (table, bytes) = cut::<u8>(bytes, rule.values());
+        let (table, bytes) = cut::<u8>(bytes, table_len(src.dtype()));
         rule.stored.fill_table(table);
         for (lo, first, tile) in Tile::all(from, to, at, radius, TILE) {
             one_tile(cx.level, v.part(first, tile.src), &rule, table, &tile, bytes, lo, &mut dst);
@@ -70,15 +70,13 @@ pub fn levels(
 
 /// Bytes of scratch that [`levels`] takes at most.
 pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams) -> usize {
-    let dst: Shape = std::array::from_fn(|a| TILE[a].min(dst[a]));
-    let src: Shape = std::array::from_fn(|a| dst[a].saturating_add(params.radius[a].saturating_mul(2)).min(src[a]));
-    let tile = Tile { src, dst, at: [0; 3], radius: params.radius };
-    let table = with_dtype!(dtype, T => <T as Coded>::VALUES);
-    padded::<u8>(table)
-        + padded::<u8>(tile.codes())
-        + padded::<u8>(tile.columns(MOST_LEVELS))
-        + padded::<u32>(tile.sums(MOST_LEVELS))
-        + padded::<u8>(tile.moves())
+    let tile = Tile::largest(src, dst, params.radius, TILE);
+    padded::<u8>(table_len(dtype)) + padded::<u8>(tile.codes()) + Work::<u32>::bytes(&tile, MOST_LEVELS)
+}
+
+/// Entries of the table of codes.
+fn table_len(dtype: DType) -> usize {
+    with_dtype!(dtype, T => <T as Coded>::VALUES)
 }
 
 /// What a voxel's openness is computed from, beside its window's counts.
@@ -109,11 +107,6 @@ impl<T: Coded> Rule<T> {
         };
         Rule { stored, slopes, missing: missing_as(params.missing), ties }
     }
-
-    /// Entries of the table of codes.
-    fn values(&self) -> usize {
-        T::VALUES
-    }
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -135,9 +128,13 @@ fn one_tile<T: Coded>(
     }
     // Where no voxel lies above the top level, its lane counts all that exist.
     let levels = rule.stored.levels().len();
-    let all = seen.gaps && (seen.above || levels == 0);
-    let job = Job { level, src, rule, tile, codes, gaps: seen.gaps, all };
-    match (levels + usize::from(all) <= 32, tile.fits::<u16>()) {
+    let all = match seen.gaps {
+        false => All::Inside,
+        true if seen.above || levels == 0 => All::Last,
+        true => All::Top,
+    };
+    let job = Job { level, src, rule, tile, codes, all };
+    match (levels + usize::from(all == All::Last) <= 32, tile.fits::<u16>()) {
         _ if !tile.planes_fit() => job.planes_beyond_bytes(lo, dst),
         (true, true) => job.run::<u16, 32>(bytes, lo, dst),
         (true, false) => job.run::<u32, 32>(bytes, lo, dst),
@@ -153,42 +150,21 @@ struct Job<'a, T: Coded> {
     rule: &'a Rule<T>,
     tile: &'a Tile,
     codes: &'a [u8],
-    /// Voxels are missing.
-    gaps: bool,
-    /// A lane counts all that are not.
-    all: bool,
+    all: All,
 }
 
 impl<T: Coded> Job<'_, T> {
     fn run<S: Sum, const L: usize>(&self, bytes: &mut [u8], lo: [usize; 3], dst: &mut AnyViewMut) {
         let tile = self.tile;
-        let (columns, bytes) = cut::<u8>(bytes, tile.columns(L));
-        let (sums, bytes) = cut::<S>(bytes, tile.sums(L));
-        let (moves, _) = cut::<u8>(bytes, tile.moves());
+        let mut work = Work::<S>::cut(bytes, tile, L);
         let (mut counts, windows) = (Counts::new(), Windows::of_columns(tile));
-        for lanes in self.sweeps(L) {
-            sweep::<S, L>(
-                self.level,
-                self.codes,
-                tile,
-                &lanes.thresholds(),
-                Work { columns, sums, moves },
-                |z, y, row| {
-                    let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
-                    count_row(self.level, self.centres(z, y), row, &windows, rows, &lanes, &mut counts);
-                    self.emit(z, y, &counts, lanes.part(), lo, dst);
-                },
-            );
+        for lanes in Lanes::sweeps(self.rule.stored.levels().len(), self.all, L) {
+            sweep::<S, L>(self.level, self.codes, tile, &lanes.thresholds(), &mut work, |z, y, row| {
+                let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
+                count_row(self.level, self.centres(z, y), row, &windows, rows, &lanes, &mut counts);
+                self.emit(z, y, &counts, lanes.part.clone(), lo, dst);
+            });
         }
-    }
-
-    fn sweeps(&self, lanes: usize) -> impl Iterator<Item = Lanes> {
-        let all = match (self.gaps, self.all) {
-            (false, _) => All::Inside,
-            (true, false) => All::Top,
-            (true, true) => All::Last,
-        };
-        Lanes::sweeps(self.rule.stored.levels().len(), all, lanes)
     }
 
     fn centres(&self, z: usize, y: usize) -> &[u8] {
@@ -233,7 +209,7 @@ impl<T: Coded> Job<'_, T> {
     /// Voxels whose openness is not interpolated: missing ones, infinities, and those in windows of one value.
     fn special<R: Voxel>(&self, [z, y]: [usize; 2], counts: &Counts, open: &mut [R]) {
         let (values, codes, rule) = (self.values(z, y), self.centres(z, y), self.rule);
-        if self.gaps || T::DTYPE.is_float() {
+        if self.all != All::Inside || T::DTYPE.is_float() {
             for (open, v) in open.iter_mut().zip(values) {
                 if gone(*v, rule.missing) {
                     *open = R::from_f64(f64::NAN);
@@ -277,7 +253,7 @@ impl<T: Coded> Job<'_, T> {
     /// Windows of more planes than a byte counts: a slab of at most 255 voxels of radius is not worth a kernel of its own.
     fn planes_beyond_bytes(&self, lo: [usize; 3], dst: &mut AnyViewMut) {
         let tile = self.tile;
-        let mut counts = Counts { narrow: true, ..Counts::new() };
+        let (mut counts, gaps) = (Counts { narrow: true, ..Counts::new() }, self.all != All::Inside);
         for (z, y) in (0..tile.dst[0]).flat_map(|z| (0..tile.dst[1]).map(move |y| (z, y))) {
             let centres = self.centres(z, y);
             for (x, centre) in centres.iter().enumerate() {
@@ -286,9 +262,9 @@ impl<T: Coded> Job<'_, T> {
                 for (z, y) in tile.window(0, z).flat_map(|z| tile.window(1, y).map(move |y| (z, y))) {
                     let row = &self.codes[(z * tile.src[1] + y) * tile.src[2]..][..tile.src[2]];
                     for code in &row[columns.clone()] {
-                        n += u32::from(!self.gaps || *code != NEVER);
+                        n += u32::from(!gaps || *code != NEVER);
                         low += u32::from(code < centre);
-                        high += u32::from(code <= centre && (!self.gaps || *code != NEVER));
+                        high += u32::from(code <= centre && (!gaps || *code != NEVER));
                     }
                 }
                 (counts.n[x], counts.low[x], counts.high[x]) = (n, low, high);

@@ -8,6 +8,7 @@
 
 use std::ops::Range;
 
+use crate::brick::scratch::{cut, padded};
 use crate::grid::{Region, Shape};
 use crate::kernel::simd::Level;
 use crate::multiversion;
@@ -49,6 +50,13 @@ impl Tile {
         })
     }
 
+    /// A tile whose source box is no smaller than that of any of those: for lengths of buffers.
+    pub fn largest(from: Shape, to: Shape, radius: [usize; 3], step: Shape) -> Tile {
+        let dst: Shape = std::array::from_fn(|a| step[a].min(to[a]));
+        let src = std::array::from_fn(|a| dst[a].saturating_add(radius[a].saturating_mul(2)).min(from[a]));
+        Tile { src, dst, at: [0; 3], radius }
+    }
+
     /// Planes, rows or columns of the window about output voxel `i`.
     #[inline(always)]
     pub fn window(&self, axis: usize, i: usize) -> Range<usize> {
@@ -75,21 +83,6 @@ impl Tile {
     /// Codes of the source box.
     pub fn codes(&self) -> usize {
         self.src.iter().product()
-    }
-
-    /// Bytes of [`Work::columns`] for so many lanes. With 64 lanes a tile should stay within the L2 cache.
-    pub fn columns(&self, lanes: usize) -> usize {
-        (self.src[1] + 2) * self.src[2] * lanes
-    }
-
-    /// Elements of [`Work::sums`].
-    pub fn sums(&self, lanes: usize) -> usize {
-        2 * (self.src[2] + 1) * lanes
-    }
-
-    /// Bytes of [`Work::moves`].
-    pub fn moves(&self) -> usize {
-        3 * self.src[1] * self.src[2]
     }
 }
 
@@ -141,14 +134,35 @@ macro_rules! sum {
 }
 sum!(u16, u32);
 
-/// Buffers of [`sweep`], cut out of scratch.
+/// Buffers of [`sweep`], cut out of scratch. With 64 lanes the columns of a tile should stay within the L2 cache.
 pub(crate) struct Work<'a, S> {
     /// Counts over planes: `[row][column][lane]`, and two rows of zeros.
-    pub columns: &'a mut [u8],
+    columns: &'a mut [u8],
     /// `[column + 1][lane]`, twice.
-    pub sums: &'a mut [S],
-    /// Changes of the columns of a plane; see [`Tile::moves`].
-    pub moves: &'a mut [u8],
+    sums: &'a mut [S],
+    /// Changes of the columns of a plane: low ends, lengths, signs.
+    moves: &'a mut [u8],
+}
+
+impl<'a, S: Sum> Work<'a, S> {
+    fn lengths(tile: &Tile, lanes: usize) -> [usize; 3] {
+        let [_, rows, width] = tile.src;
+        [(rows + 2) * width * lanes, 2 * (width + 1) * lanes, 3 * rows * width]
+    }
+
+    /// Bytes that [`Work::cut`] takes.
+    pub fn bytes(tile: &Tile, lanes: usize) -> usize {
+        let [columns, sums, moves] = Self::lengths(tile, lanes);
+        padded::<u8>(columns) + padded::<S>(sums) + padded::<u8>(moves)
+    }
+
+    pub fn cut(bytes: &'a mut [u8], tile: &Tile, lanes: usize) -> Work<'a, S> {
+        let lengths = Self::lengths(tile, lanes);
+        let (columns, bytes) = cut::<u8>(bytes, lengths[0]);
+        let (sums, bytes) = cut::<S>(bytes, lengths[1]);
+        let (moves, _) = cut::<u8>(bytes, lengths[2]);
+        Work { columns, sums, moves }
+    }
 }
 
 /// The sums of one output row.
@@ -182,7 +196,7 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
     codes: &[u8],
     tile: &Tile,
     lanes: &[u8; L],
-    work: Work<S>,
+    work: &mut Work<S>,
     mut emit: impl FnMut(usize, usize, Row<S, L>),
 ) {
     assert!(tile.fits::<S>() && codes.len() == tile.codes());
@@ -190,10 +204,10 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
     assert!(seen, "every row of the source is in a window");
     let [_, rows, width] = tile.src;
     let plane = rows * width;
-    let columns = work.columns[..tile.columns(L)].as_chunks_mut::<L>().0;
+    let columns = work.columns.as_chunks_mut::<L>().0;
     let (columns, zeros) = columns.split_at_mut(plane);
     let (zeros, none) = zeros.split_at_mut(width);
-    let (sums, first) = work.sums[..tile.sums(L)].as_chunks_mut::<L>().0.split_at_mut(width + 1);
+    let (sums, first) = work.sums.as_chunks_mut::<L>().0.split_at_mut(width + 1);
     columns.fill([0; L]);
     zeros.fill([0; L]);
     none.fill([0; L]);
@@ -258,7 +272,6 @@ impl<'a> Moves<'a> {
     fn between(level: Level, enters: &[u8], leaves: &[u8], bytes: &'a mut [u8]) -> Moves<'a> {
         let (low, rest) = bytes.split_at_mut(enters.len());
         let (length, sign) = rest.split_at_mut(enters.len());
-        let sign = &mut sign[..enters.len()];
         find_moves(level, enters, leaves, low, length, sign);
         Moves { low, length, sign }
     }

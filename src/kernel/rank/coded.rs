@@ -71,25 +71,11 @@ impl<T: crate::grid::Voxel> Source<'_, T> {
     }
 }
 
-/// The tile at a part of the output box, and the place of its source box in the source.
-fn tile(plan: &Plan, most: Shape, lo: [usize; 3]) -> (Tile, [usize; 3]) {
-    let dst: Shape = std::array::from_fn(|a| most[a].min(plan.dst[a] - lo[a]));
-    let from: [usize; 3] = std::array::from_fn(|a| (plan.at[a] + lo[a]).saturating_sub(plan.radius[a]));
-    let to: [usize; 3] = std::array::from_fn(|a| (plan.at[a] + lo[a] + dst[a] + plan.radius[a]).min(plan.src[a]));
-    let src = std::array::from_fn(|a| to[a] - from[a]);
-    let at = std::array::from_fn(|a| plan.at[a] + lo[a] - from[a]);
-    (Tile { src, dst, at, radius: plan.radius }, from)
-}
-
 /// Bytes of scratch that [`count_all`] takes at most.
 pub(super) fn scratch_bytes<K: Index>(plan: &Plan) -> usize {
-    // A source box no smaller than that of any tile.
-    let dst: Shape = std::array::from_fn(|a| K::TILE[a].min(plan.dst[a]));
-    let src: Shape = std::array::from_fn(|a| (dst[a] + 2 * plan.radius[a]).min(plan.src[a]));
-    let tile = Tile { src, dst, at: [0; 3], radius: plan.radius };
-    let counts = padded::<u8>(tile.columns(LANES)) + padded::<u32>(tile.sums(LANES)) + padded::<u8>(tile.moves());
+    let tile = Tile::largest(plan.src, plan.dst, plan.radius, K::TILE);
     let buckets = if K::KEYS > MOST { buckets::scratch_bytes(&tile, K::KEYS) } else { 0 };
-    padded::<u8>(K::KEYS) + padded::<u8>(tile.codes()) + counts + buckets
+    padded::<u8>(K::KEYS) + padded::<u8>(tile.codes()) + Work::<u32>::bytes(&tile, LANES) + buckets
 }
 
 /// Voxels of a window from which this way is the faster one. 8 bits: at radius 5 (1331 voxels) comparing takes 18.7 ns per
@@ -118,17 +104,12 @@ pub(super) fn count_all<T: ToKey<K>, K: Index>(
     dst: &mut ViewMut<f32>,
 ) {
     let (table, bytes) = cut::<u8>(bytes, K::KEYS);
-    for z in (0..plan.dst[0]).step_by(K::TILE[0]) {
-        for y in (0..plan.dst[1]).step_by(K::TILE[1]) {
-            for x in (0..plan.dst[2]).step_by(K::TILE[2]) {
-                let (tile, from) = tile(plan, K::TILE, [z, y, x]);
-                let part = Source { view: source.view.part(from, tile.src), ..*source };
-                let (codes, bytes) = cut::<u8>(bytes, tile.codes());
-                let start = dst.data.len().min(z * dst.plane + y * dst.row + x);
-                let mut out = ViewMut { data: &mut dst.data[start..], shape: tile.dst, plane: dst.plane, row: dst.row };
-                count_tile::<T, K>(level, &part, &tile, plan.ties, table, codes, bytes, &mut out);
-            }
-        }
+    for ([z, y, x], first, tile) in Tile::all(plan.src, plan.dst, plan.at, plan.radius, K::TILE) {
+        let part = Source { view: source.view.part(first, tile.src), ..*source };
+        let (codes, bytes) = cut::<u8>(bytes, tile.codes());
+        let start = dst.data.len().min(z * dst.plane + y * dst.row + x);
+        let mut out = ViewMut { data: &mut dst.data[start..], shape: tile.dst, plane: dst.plane, row: dst.row };
+        count_tile::<T, K>(level, &part, &tile, plan.ties, table, codes, bytes, &mut out);
     }
 }
 
@@ -241,13 +222,11 @@ impl Job<'_> {
     /// correct them first.
     fn run<S: Sum, const L: usize>(&self, bytes: &mut [u8], buckets: &mut Option<Buckets>, out: &mut ViewMut<f32>) {
         let tile = self.tile;
-        let (columns, bytes) = cut::<u8>(bytes, tile.columns(L));
-        let (sums, bytes) = cut::<S>(bytes, tile.sums(L));
-        let (moves, _) = cut::<u8>(bytes, tile.moves());
+        let mut work = Work::<S>::cut(bytes, tile, L);
         let windows = Windows::of_columns(tile);
         for group in self.groups::<L>() {
             let lanes = group.lanes();
-            sweep::<S, L>(self.level, self.codes, tile, &lanes, Work { columns, sums, moves }, |z, y, row| {
+            sweep::<S, L>(self.level, self.codes, tile, &lanes, &mut work, |z, y, row| {
                 let place = ((tile.at[0] + z) * tile.src[1] + tile.at[1] + y) * tile.src[2] + tile.at[2];
                 let centres = &self.codes[place..][..tile.dst[2]];
                 let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
