@@ -1,8 +1,8 @@
 //! The GPU lane beside the CPU kernels (one thread) on the same brick, and a stream of bricks beside the sum of its parts.
 //!
-//! `cargo bench --bench gpu [-- WORD ...]` (only rows that hold a word, such as `gradient` or `f32`; without words
+//! `cargo bench --bench gpu [-- [--passes] WORD ...]` (`--passes`: every dispatch's time, too; only rows that hold a word, such as `gradient` or `f32`; without words
 //! benches/gpu_rivals.py runs at the end): uses a hardware adapter, else a software one, and says which. Figures of a software adapter (lavapipe) say nothing about a GPU's speed. Results are
-//! compared with the CPU's before a time is printed; a wrong one ends the bench.
+//! compared with the CPU's before a time is printed; after a wrong one it ends with status 1.
 //!
 //! Columns, in ms: by the wall clock `pack` (host writes voxels into the mapped staging buffer), `device` (from submission
 //! until results are mapped), `finish` (host turns sums into results), `whole` (the call); by the device's own time stamps
@@ -161,6 +161,32 @@ impl Case {
             _ => vec![DType::F32],
         };
         types.into_iter().map(|t| Voxels::zeroed(t, self.extent(shape).iter().product())).collect()
+    }
+
+    /// A line of every dispatch in microseconds, with the share of the copy rate at which passes of windows and Gaussians move
+    /// what they have to read and write.
+    fn passes(&self, passes: &[(&'static str, f64)], dtype: DType, shape: Shape, rate: f64) -> String {
+        let voxels = shape.iter().product::<usize>() as f64;
+        let square = matches!(&self.kernel, Kernel::Window(c, _) if c.contains(&WindowChannel::Variance));
+        let mut seen = std::collections::HashMap::new();
+        let line = passes.iter().map(|(name, seconds)| {
+            let cell = match *name {
+                "window_sums32" | "window_extremes" | "gaussian" => 4,
+                "window_sums64" | "window_order" => 8,
+                "window_moments" if square => 20,
+                "window_moments" | "gaussian_variance" => 12,
+                _ => 0,
+            };
+            let number = seen.entry(*name).or_insert(0);
+            let from = if *number % 3 == 0 { dtype.size() } else { cell };
+            *number += 1;
+            let share = match cell {
+                0 => String::new(),
+                _ => format!(" ({:.0} %)", 100.0 * (from + cell) as f64 * voxels / seconds / rate),
+            };
+            format!("{name} {:.0}{share}", seconds * 1e6)
+        });
+        format!("    us: {}", line.collect::<Vec<_>>().join(", "))
     }
 
     /// Seconds of a call, and its phases where it ran on the device; `None` for the CPU kernel.
@@ -433,13 +459,18 @@ fn main() {
         "{:<22} {:<4} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",
         "kernel", "type", "pack", "device", "finish", "whole", "up", "compute", "back", "cpu"
     );
+    let rate = (0..ROUNDS).filter_map(|_| gpu.copy_rate().expect("the device works")).fold(0.0, f64::max);
+    if rate > 0.0 {
+        println!("copy on the device: {:.0} GB/s, read and written", rate * 1e-9);
+    }
     let shape = [size; 3];
     let words: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
+    let passes = std::env::args().any(|a| a == "--passes");
     let wanted = |case: &Case, dtype: DType| {
         let row = format!("{} {dtype}", case.name);
         words.is_empty() || words.iter().any(|w| row.contains(w.as_str()))
     };
-    let mut scratch = Scratch::new();
+    let (mut scratch, mut wrong) = (Scratch::new(), 0);
     for dtype in [DType::U8, DType::U16, DType::F32] {
         let volume = noise(dtype, shape);
         for case in cases().iter().filter(|c| c.takes(dtype) && wanted(c, dtype)) {
@@ -453,7 +484,8 @@ fn main() {
             }
             if !cpu.iter().zip(&got).all(|(a, b)| agree(a, b, case.tolerance(dtype))) {
                 println!("{} {dtype}: WRONG", case.name);
-                std::process::exit(1);
+                wrong += 1;
+                continue;
             }
             let (whole, t) = best;
             let stamp = |k: usize| match t.stamps.iter().sum::<f64>() {
@@ -469,7 +501,14 @@ fn main() {
                 stamp(1),
                 stamp(2)
             );
+            if passes {
+                println!("{}", case.passes(&t.passes, dtype, shape, rate));
+            }
         }
+    }
+    if wrong > 0 {
+        println!("{wrong} results differ from the CPU's");
+        std::process::exit(1);
     }
     println!(
         "stream of bricks of {size}^3: bricks/s by one thread and by {SLOTS}, then ms per brick of host and device alone, then \

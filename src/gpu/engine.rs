@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use super::backend;
 use super::device::{self, Device, SlotGuard};
 use super::facts::{GpuFacts, GpuKind};
-use super::record::{Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Recording, STAMP_BYTES, groups};
+use super::record::{Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Recording, STAMP_BYTES, STAMPS, groups};
+use super::recorder::Recorder;
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
 /// stays silent for longer is taken for lost.
@@ -27,7 +28,7 @@ impl fmt::Display for GpuError {
 impl std::error::Error for GpuError {}
 
 /// Seconds of the phases of a call, summed over its parts.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Times {
     /// Making and mapping buffers, packing voxels into them.
     pub pack: f64,
@@ -37,6 +38,43 @@ pub struct Times {
     pub finish: f64,
     /// By the device's own clock: the copy there, the passes, the copy back. 0 without time stamps.
     pub stamps: [f64; 3],
+    /// Each dispatch by the same clock, with its shader's name, in their order. Empty without time stamps, and where a part has
+    /// more of them than there is room for.
+    pub passes: Vec<(&'static str, f64)>,
+}
+
+impl Times {
+    /// Adds a part's stamps: before the copy there, after it, after each command up to the last dispatch, after the copies back.
+    fn stamp(&mut self, stamps: &[u64], commands: &[Command], tick: f64) {
+        let seconds = |pair: [u64; 2]| pair[1].saturating_sub(pair[0]) as f64 * tick * 1e-9;
+        let last = stamps.len() - 1;
+        for (sum, pair) in self.stamps.iter_mut().zip([[0, 1], [1, last - 1], [last - 1, last]]) {
+            *sum += seconds(pair.map(|k| stamps[k]));
+        }
+        if each(commands) {
+            let made = commands.iter().zip(stamps[1..].windows(2));
+            self.passes.extend(made.filter_map(|(command, pair)| match command {
+                Command::Dispatch(d) => Some((d.shader.name(), seconds([pair[0], pair[1]]))),
+                _ => None,
+            }));
+        }
+    }
+}
+
+/// Whether there is room for a stamp after each command.
+fn each(commands: &[Command]) -> bool {
+    commands.len() + 3 <= STAMPS
+}
+
+/// The commands up to the last dispatch, and what comes back after it.
+fn halves(recording: &Recording) -> (&[Command], &[Command]) {
+    let last = recording.commands.iter().rposition(|c| matches!(c, Command::Dispatch(_)));
+    recording.commands.split_at(last.map_or(0, |l| l + 1))
+}
+
+/// Time stamps of a part.
+fn stamps_of(commands: &[Command]) -> usize {
+    if each(commands) { commands.len() + 3 } else { 4 }
 }
 
 /// A GPU that runs kernels for any number of threads.
@@ -86,6 +124,29 @@ impl Gpu {
     /// Holds each buffer to `bytes` (at most what the adapter allows); larger calls are cut into parts.
     pub fn set_cap(&mut self, bytes: u64) {
         self.cap = bytes.min(self.facts.most_bytes);
+    }
+
+    /// Bytes per second that a copy on the device reads and writes, both counted: what passes over memory are measured by.
+    /// `None` without time stamps ([`Gpu::open_timed`]).
+    ///
+    /// # Errors
+    /// A failure of the device.
+    pub fn copy_rate(&self) -> Result<Option<f64>, GpuError> {
+        /// Larger than caches.
+        const BYTES: u64 = 256 << 20;
+        let bytes = BYTES.min(self.cap);
+        let mut recorder = Recorder::new(4);
+        let [a, b] = [(); 2].map(|()| recorder.take(bytes));
+        let back = recorder.read(b.into(), 4);
+        debug_assert_eq!(back, 0);
+        let mut recording = recorder.finish().map_err(|e| GpuError(format!("{e:?}")))?;
+        let copies = [(a, b), (b, a), (a, b), (b, a)].map(|(from, to)| Command::Copy { from, to, bytes });
+        recording.commands.splice(0..0, copies);
+        self.attempt(|device| {
+            let mut times = Times::default();
+            run_part(device, &recording, &mut |_| true, &mut |_| Ok(()), &mut times)?;
+            Ok(device.tick.map(|_| 8.0 * bytes as f64 / times.stamps[2]))
+        })
     }
 
     pub(super) fn cap(&self) -> u64 {
@@ -210,9 +271,9 @@ fn on_device(
         let (results, stamps) = bytes.split_at(sizes.read as usize);
         finish(Some(results))?;
         if let Some(tick) = device.tick {
-            let stamps: &[u64] = bytemuck::try_cast_slice(&stamps[..32]).unwrap_or(&[0; 4]);
-            for (sum, pair) in times.stamps.iter_mut().zip(stamps.windows(2)) {
-                *sum += pair[1].saturating_sub(pair[0]) as f64 * tick * 1e-9;
+            let (compute, _) = halves(recording);
+            if let Ok(stamps) = bytemuck::try_cast_slice(&stamps[..8 * stamps_of(compute)]) {
+                times.stamp(stamps, compute, tick);
             }
         }
     }
@@ -272,12 +333,11 @@ fn write(buffer: &wgpu::Buffer, recording: &Recording, fill: Fill) -> Result<boo
 /// Encodes and submits the copies and passes of a part.
 fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::SubmissionIndex {
     let (slot, sizes) = (&held.slot, recording.sizes);
+    let (compute, back) = halves(recording);
+    let count = stamps_of(compute) as u32;
     let stamps = device.tick.map(|_| {
-        device.device.create_query_set(&wgpu::QuerySetDescriptor {
-            label: None,
-            ty: wgpu::QueryType::Timestamp,
-            count: 4,
-        })
+        let ty = wgpu::QueryType::Timestamp;
+        device.device.create_query_set(&wgpu::QuerySetDescriptor { label: None, ty, count })
     });
     let mut encoder = device.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("part") });
     let stamp = |encoder: &mut wgpu::CommandEncoder, k: u32| {
@@ -293,18 +353,24 @@ fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::Sub
     }
     stamp(&mut encoder, 1);
     let mut number = 0;
-    let last = recording.commands.iter().rposition(|c| matches!(c, Command::Dispatch(_)));
-    let (compute, back) = recording.commands.split_at(last.map_or(0, |l| l + 1));
-    encode(device, held, compute, &mut number, &mut encoder);
-    stamp(&mut encoder, 2);
+    if stamps.is_some() && each(compute) {
+        for (command, k) in compute.chunks(1).zip(2..) {
+            encode(device, held, command, &mut number, &mut encoder);
+            stamp(&mut encoder, k);
+        }
+    } else {
+        encode(device, held, compute, &mut number, &mut encoder);
+        stamp(&mut encoder, 2);
+    }
     encode(device, held, back, &mut number, &mut encoder);
-    stamp(&mut encoder, 3);
+    stamp(&mut encoder, count - 1);
     if let Some(set) = &stamps {
         let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
-        let desc = wgpu::BufferDescriptor { label: Some("stamps"), size: 32, usage, mapped_at_creation: false };
+        let size = 8 * count as u64;
+        let desc = wgpu::BufferDescriptor { label: Some("stamps"), size, usage, mapped_at_creation: false };
         let resolved = device.device.create_buffer(&desc);
-        encoder.resolve_query_set(set, 0..4, &resolved, 0);
-        encoder.copy_buffer_to_buffer(&resolved, 0, slot.read.get(), sizes.read, 32);
+        encoder.resolve_query_set(set, 0..count, &resolved, 0);
+        encoder.copy_buffer_to_buffer(&resolved, 0, slot.read.get(), sizes.read, size);
     }
     device.queue.submit([encoder.finish()])
 }
@@ -322,6 +388,9 @@ fn encode(
         match &run[0] {
             Command::Readback(r) => {
                 encoder.copy_buffer_to_buffer(slot.of(r.from.buffer), r.from.from, slot.read.get(), r.to, r.bytes);
+            }
+            Command::Copy { from, to, bytes } => {
+                encoder.copy_buffer_to_buffer(slot.of(*from), 0, slot.of(*to), 0, *bytes);
             }
             Command::Clear(buffer) => encoder.clear_buffer(slot.of(*buffer), 0, Some(FLAG_BYTES)),
             Command::Dispatch(_) => {

@@ -5,8 +5,9 @@ pub use super::shaders::Shader;
 
 /// Bytes between the parameters of dispatches in their buffer (the largest alignment that an adapter may ask for).
 pub const PARAMS_STRIDE: u64 = 256;
-/// Room for time stamps behind the results.
-pub const STAMP_BYTES: u64 = 256;
+/// Most time stamps of a part, and room for them behind the results.
+pub const STAMPS: usize = 256;
+pub const STAMP_BYTES: u64 = 8 * STAMPS as u64;
 /// Threads of a workgroup; in every shader.
 pub const GROUP: u32 = 64;
 
@@ -64,6 +65,12 @@ pub enum Command {
     Dispatch(Dispatch),
     /// Zeros in the first [`FLAG_BYTES`] of a buffer.
     Clear(Buffer),
+    /// From the start of one buffer to the start of another.
+    Copy {
+        from: Buffer,
+        to: Buffer,
+        bytes: u64,
+    },
     Readback(Readback),
 }
 
@@ -99,6 +106,10 @@ impl Recording {
             Command::Dispatch(d) => self.dispatch_fault(d),
             Command::Clear(b) if self.sizes.of(*b) < FLAG_BYTES => Some(format!("{b:?} has nothing to clear")),
             Command::Clear(_) => None,
+            Command::Copy { from, to, bytes } => {
+                let wrong = from == to || [from, to].iter().any(|b| *bytes > self.sizes.of(**b));
+                wrong.then(|| format!("a copy of {bytes} bytes from {from:?} to {to:?}"))
+            }
             Command::Readback(r) => {
                 let wrong = r.from.from + r.bytes > self.sizes.of(r.from.buffer)
                     || r.to + r.bytes > self.sizes.read
@@ -218,6 +229,9 @@ mod tests {
         assert!(of(vec![dispatch(&[Buffer::Source, Buffer::Work(1)])]).is_some(), "a buffer of no bytes");
         assert!(of(vec![back(0, 516)]).is_some() && of(vec![back(256, 260)]).is_some());
         assert!(of(vec![Command::Clear(Buffer::Work(1))]).is_some());
+        let copy = |from, to, bytes| of(vec![Command::Copy { from, to, bytes }]);
+        assert_eq!(copy(Buffer::Source, a, 256), None);
+        assert!(copy(a, a, 256).is_some() && copy(Buffer::Source, a, 512).is_some());
         assert!(of(vec![dispatch(&[Buffer::Source, a]); 2]).is_some(), "parameters of two");
     }
 }

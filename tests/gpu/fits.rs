@@ -6,7 +6,7 @@ use occlude::gpu::GpuFacts;
 
 use super::adapter;
 use super::common::{assert_same, decode};
-use super::setup::{CPU, SOFTWARE, flows, folder, found, place, plan, plan_with, run_on};
+use super::setup::{CPU, flows, folder, found, lane, place, plan, plan_with, run_on};
 
 /// So many cuts of one channel, of which nothing is read before the last is made.
 fn many(count: usize) -> String {
@@ -46,7 +46,7 @@ fn too_many_buffers_take_a_flow_apart_and_the_plan_says_how_many() {
     let Some(_) = adapter() else { return };
     run_on(dir.path(), &text, &[CPU]);
     let cpu = decode(&dir.path().join("out/all.zarr"));
-    let report = run_on(dir.path(), &text, &[SOFTWARE]);
+    let report = run_on(dir.path(), &text, &[lane()]);
     assert_same("step by step", &cpu, &decode(&dir.path().join("out/all.zarr")));
     let stage = |name: &str| report.stages.iter().find(|s| s.name == name).unwrap();
     assert_eq!((&stage("stats").device[..], &stage("cut3").device[..]), ("gpu", "cpu"));
@@ -98,7 +98,7 @@ fn a_sweep_that_would_read_too_much_runs_on_the_cpu_and_the_plan_says_how_much()
     let dir = folder([100, 100, 100]);
     assert_eq!(place(&plan(dir.path(), text, &[]), "swept"), ("gpu", "Test 9000"));
     let small = GpuFacts { most_bytes: 1_300_000, ..found() };
-    let (plan, _) = plan_with(dir.path(), text, &[SOFTWARE], Ok(small)).unwrap();
+    let (plan, _) = plan_with(dir.path(), text, &[lane()], Ok(small)).unwrap();
     let (device, why) = place(&plan, "swept");
     assert_eq!(device, "cpu");
     assert!(why.contains("voxels for each of a brick, of at most 4") && why.ends_with("runs on the CPU"), "{why}");

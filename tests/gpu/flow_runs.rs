@@ -8,7 +8,7 @@ use occlude::plan::Plan;
 use occlude::run::RunOptions;
 
 use super::common::{Decoded, assert_same, decode, parse, run_with};
-use super::setup::{CPU, SOFTWARE, folder, folder_of, place, plan, run_on};
+use super::setup::{CPU, folder, folder_of, lane, place, plan, run_on};
 use super::{adapter, setup};
 
 const CONFIG: &str = r#"
@@ -123,7 +123,7 @@ from = "both"
 const LIT_OUTPUTS: [&str; 7] = ["var", "std", "least", "most", "mean", "cut", "light"];
 
 fn run(dir: &Path, text: &str, sets: &[&str]) -> Decoded {
-    run_on(dir, text, &[&[SOFTWARE], sets].concat());
+    run_on(dir, text, &[&[lane()], sets].concat());
     decode(&dir.join("out/slope.zarr"))
 }
 
@@ -178,9 +178,9 @@ fn statistics_light_and_levels_of_every_kind_equal_the_cpus() {
         let [a, b] = [&cpu, &gpu].map(|d| std::fs::read(d.path().join("out/both.npy")).unwrap());
         assert!(a == b, "{what}: both.npy");
     };
-    run_on(gpu.path(), LIT, &[SOFTWARE]);
+    run_on(gpu.path(), LIT, &[lane()]);
     same("bricks as given");
-    run_on(gpu.path(), LIT, &[SOFTWARE, "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]);
+    run_on(gpu.path(), LIT, &[lane(), "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]);
     same("a little memory");
 }
 
@@ -221,7 +221,7 @@ fn bricks_that_the_device_leaves_and_constant_ones_run_one_by_one() {
     let narrow = ["stage.bell.sigma=[0.2, 0.2, 0.2]", "run.brick=[16, 16, 16]"];
     let all = run(dir.path(), CONFIG, &narrow);
     assert_same("no skipping", &all, &{
-        let sets = [&[SOFTWARE], &narrow[..]].concat();
+        let sets = [&[lane()], &narrow[..]].concat();
         let options = RunOptions { overwrite: true, no_skip: true, ..Default::default() };
         run_with(&parse(dir.path(), CONFIG, &sets), &options);
         decode(&dir.path().join("out/slope.zarr"))
@@ -307,8 +307,8 @@ fn steps_of_every_border_run_in_one_go_and_equal_the_cpus() {
     let Some(_) = adapter() else { return };
     run_on(cpu.path(), BORDERS, &[CPU]);
     for (what, sets) in [
-        ("bricks as given", &[SOFTWARE][..]),
-        ("a little memory", &[SOFTWARE, "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]),
+        ("bricks as given", &[lane()][..]),
+        ("a little memory", &[lane(), "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]),
     ] {
         let report = run_on(gpu.path(), BORDERS, sets);
         let row = report.stages.iter().find_map(|s| s.together.clone()).unwrap();

@@ -1,7 +1,7 @@
 //! CPU and GPU agree (SPEC 5.6). What is made of sums, extremes and contributions in exact integers must equal the CPU's
 //! **bit for bit**, since the CPU's own row functions finish them; floats must lie within `facts::tolerance`.
 //!
-//! Without a Vulkan adapter these tests pass and are listed when all have run, unless OCCLUDE_REQUIRE_GPU_TESTS=1.
+//! They run on software Vulkan, on a GPU with OCCLUDE_TEST_GPU=hardware. Without an adapter these tests pass and are listed when all have run, unless OCCLUDE_REQUIRE_GPU_TESTS=1.
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -40,9 +40,18 @@ extern "C" fn list_skipped() {
     unsafe { libc::write(2, text.as_ptr().cast(), text.len()) };
 }
 
-/// The software adapter; without one the test is noted as skipped.
+/// The software adapter, or with OCCLUDE_TEST_GPU=hardware a GPU.
+fn kind() -> GpuKind {
+    match std::env::var("OCCLUDE_TEST_GPU").as_deref() {
+        Ok("hardware") => GpuKind::Hardware,
+        Ok(other) => panic!("OCCLUDE_TEST_GPU is {other:?}: \"hardware\" is known"),
+        Err(_) => GpuKind::Software,
+    }
+}
+
+/// The adapter to test; without one the test is noted as skipped.
 fn adapter() -> Option<Gpu> {
-    match Gpu::open(GpuKind::Software) {
+    match Gpu::open(kind()) {
         Ok(gpu) => Some(gpu),
         Err(why) => {
             assert!(why.starts_with("looked for"), "there is an adapter, but: {why}");

@@ -12,7 +12,7 @@ use occlude::kernel::occlusion_map::{Moments, base, coarsen};
 use occlude::kernel::simd::Level;
 
 use super::common::{Decoded, assert_same, decode};
-use super::setup::{CPU, SOFTWARE, folder, run_on};
+use super::setup::{CPU, folder, lane, run_on};
 use super::{adapter, fills};
 
 const DTYPES: [DType; 4] = [DType::U8, DType::I8, DType::U16, DType::I16];
@@ -216,11 +216,11 @@ fn a_run_makes_maps_on_the_gpu_and_shows_no_brick() {
     let Some(_) = adapter() else { return };
     let dir = folder([40, 70, 80]);
     let cpu = run(dir.path(), &[CPU]);
-    let all = run(dir.path(), &[SOFTWARE]);
+    let all = run(dir.path(), &[lane()]);
     let sets: [&[&str]; 3] = [
-        &[SOFTWARE, "run.brick=[32, 16, 64]"],
-        &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"],
-        &[SOFTWARE, "run.brick=[64, 96, 96]"],
+        &[lane(), "run.brick=[32, 16, 64]"],
+        &[lane(), "run.memory='40MiB'", "run.brick='auto'"],
+        &[lane(), "run.brick=[64, 96, 96]"],
     ];
     for sets in sets {
         for (a, b) in all.iter().zip(run(dir.path(), sets)) {

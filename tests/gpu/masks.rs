@@ -14,7 +14,7 @@ use occlude::stage::{CombineKind, Reduce, WindowChannel, WindowParams};
 
 use super::common::{Decoded, assert_same, decode, hash, parse, run_with};
 use super::levels::{cx, differs, flow_of, hostile, made, on_cpu, point, pointwise_on_cpu, pyramids, results_of, step};
-use super::setup::{CPU, SOFTWARE, flows, folder, place, plan, run_on};
+use super::setup::{CPU, flows, folder, lane, place, plan, run_on};
 use super::{adapter, fills};
 
 /// Masks that break careless levels: noise, whole cells in and out, single voxels, halves, nothing but the ends.
@@ -231,7 +231,7 @@ fn masked_stages_run_in_one_go_and_equal_the_cpus() {
             assert_same(&format!("{what}: {name}"), a, &b);
         }
     };
-    let report = run_on(gpu.path(), CONFIG, &[SOFTWARE]);
+    let report = run_on(gpu.path(), CONFIG, &[lane()]);
     same("bricks as given");
     let stage = |name: &str| report.stages.iter().find(|s| s.name == name).unwrap();
     let together = stage("stats, band, all, both in one go");
@@ -241,15 +241,15 @@ fn masked_stages_run_in_one_go_and_equal_the_cpus() {
     assert_eq!(stage("both").part_of.as_ref(), Some(&together.name));
     assert_eq!((stage("all").voxels, together.voxels), (60_000, 60_000));
     assert!(stage("hung").part_of.is_none() && stage("hung").seconds > 0.0);
-    run_on(gpu.path(), CONFIG, &[SOFTWARE, "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]);
+    run_on(gpu.path(), CONFIG, &[lane(), "run.memory='48MiB'", "run.brick='auto'", "run.threads=4"]);
     same("a little memory");
     let options = RunOptions { overwrite: true, no_skip: true, ..Default::default() };
-    run_with(&parse(gpu.path(), CONFIG, &[SOFTWARE]), &options);
+    run_with(&parse(gpu.path(), CONFIG, &[lane()]), &options);
     same("no skipping");
     // Nothing of a brick is needed by some, or by all.
     let high = ["stage.stats.where.min=70000", "stage.band.where.iso=[70000]", "stage.both.where.max=-1"];
     run_on(cpu.path(), CONFIG, &[&[CPU], &high[..]].concat());
-    let report = run_on(gpu.path(), CONFIG, &[&[SOFTWARE], &high[..]].concat());
+    let report = run_on(gpu.path(), CONFIG, &[&[lane()], &high[..]].concat());
     let row = report.stages.iter().find_map(|s| s.together.clone()).unwrap();
     assert_eq!(row.bricks, 2 * 2 * 2, "the others still run in one go");
     for ((name, a), b) in OUTPUTS.iter().zip(decoded(cpu.path())).zip(decoded(gpu.path())) {

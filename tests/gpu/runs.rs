@@ -8,7 +8,7 @@ use occlude::plan::Plan;
 use occlude::run::{RunOptions, Session, Silent};
 
 use super::common::{Decoded, assert_same, decode, metadata, parse, program, run_with};
-use super::setup::{CPU, SOFTWARE, place, run_on};
+use super::setup::{CPU, lane, place, run_on};
 use super::{adapter, setup};
 
 /// Steps that have a GPU kernel, steps that have none, borders, a mask, levels, bricks that are cut.
@@ -181,8 +181,8 @@ fn the_comparison_of_floats_can_fail() {
 fn floats_of_the_gpu_do_not_show_bricks() {
     let Some(_) = adapter() else { return };
     let (one, two) = (folder(), folder());
-    run_on(one.path(), CONFIG, &[SOFTWARE]);
-    run_with(&parse(two.path(), CONFIG, &[SOFTWARE, "run.brick=[32, 16, 64]"]), &RunOptions::default());
+    run_on(one.path(), CONFIG, &[lane()]);
+    run_with(&parse(two.path(), CONFIG, &[lane(), "run.brick=[32, 16, 64]"]), &RunOptions::default());
     for (name, _) in CLOSE {
         let [a, b] = [&one, &two].map(|d| decode(&d.path().join("out").join(name)));
         assert_same(name, &a, &b);
@@ -208,7 +208,7 @@ fn a_whole_run_on_the_gpu_equals_the_cpu_run() {
     let Some(_) = adapter() else { return };
     let (cpu, gpu) = (folder(), folder());
     run_on(cpu.path(), CONFIG, &[CPU]);
-    let report = run_on(gpu.path(), CONFIG, &[SOFTWARE]);
+    let report = run_on(gpu.path(), CONFIG, &[lane()]);
     assert_same_outputs("gpu:software", cpu.path(), gpu.path());
     assert_close_outputs("gpu:software", cpu.path(), gpu.path());
     let device = |name: &str| report.stages.iter().find(|s| s.name == name).map(|s| s.device.clone());
@@ -234,7 +234,7 @@ fn a_little_memory_cuts_bricks_on_the_device_and_changes_nothing() {
     let Some(_) = adapter() else { return };
     let (cpu, gpu) = (folder(), folder());
     run_on(cpu.path(), CONFIG, &[CPU]);
-    run_on(gpu.path(), CONFIG, &[SOFTWARE, "run.memory='40MiB'", "run.brick='auto'"]);
+    run_on(gpu.path(), CONFIG, &[lane(), "run.memory='40MiB'", "run.brick='auto'"]);
     assert_same_outputs("40 MiB", cpu.path(), gpu.path());
     assert_close_outputs("40 MiB", cpu.path(), gpu.path());
 }
@@ -244,7 +244,7 @@ fn a_run_resumes_on_the_device_that_it_was_begun_on() {
     let Some(_) = adapter() else { return };
     let (cpu, gpu) = (folder(), folder());
     run_on(cpu.path(), CONFIG, &[CPU]);
-    let config = parse(gpu.path(), CONFIG, &[SOFTWARE]);
+    let config = parse(gpu.path(), CONFIG, &[lane()]);
     let options = RunOptions { resume: true, ..Default::default() };
     let session = Session::open(&config, &options, &Silent).unwrap();
     session.run_task(0).unwrap();
@@ -331,7 +331,7 @@ fn many_workers_share_bricks_between_the_lanes() {
     let bricks = "run.brick=[8, 16, 32]";
     run_on(cpu.path(), CONFIG, &[CPU]);
     let run = |dir: &Path, sets: &[&str]| {
-        let report = run_on(dir, CONFIG, &[&[SOFTWARE, bricks, "run.threads=8"], sets].concat());
+        let report = run_on(dir, CONFIG, &[&[lane(), bricks, "run.threads=8"], sets].concat());
         let on_cpu = |name: &str| report.stages.iter().find(|s| s.name == name).map_or(0, |s| s.bricks_on_cpu);
         (report.byte_identity_waived, ["swept", "floats", "stats", "mirrored", "bell"].map(on_cpu))
     };
@@ -409,7 +409,7 @@ fn a_device_lost_in_a_run_is_opened_anew_or_ends_it_resumable() {
     let (cpu, once, twice) = (long(), long(), long());
     run_on(cpu.path(), LONG, &[CPU]);
     let options = RunOptions { resume: true, ..Default::default() };
-    let config = parse(once.path(), LONG, &[SOFTWARE]);
+    let config = parse(once.path(), LONG, &[lane()]);
     let session = Session::open(&config, &options, &Silent).unwrap();
     let tasks = session.task_count();
     assert!(tasks > 2, "{tasks} tasks");
@@ -419,7 +419,7 @@ fn a_device_lost_in_a_run_is_opened_anew_or_ends_it_resumable() {
     }
     session.finish().unwrap();
     same("lost and opened anew", cpu.path(), once.path());
-    let config = parse(twice.path(), LONG, &[SOFTWARE]);
+    let config = parse(twice.path(), LONG, &[lane()]);
     let session = Session::open(&config, &options, &Silent).unwrap();
     session.run_task(0).unwrap();
     session.lose_gpu(true);

@@ -2,14 +2,21 @@
 
 use std::path::Path;
 
-use occlude::gpu::GpuFacts;
+use occlude::gpu::{GpuFacts, GpuKind};
 use occlude::grid::Shape;
 use occlude::plan::Plan;
 use occlude::run::{Report, RunOptions};
 
 use super::common::{mixed_u16, parse, run_with, u16_bytes, write_npy};
 
-pub const SOFTWARE: &str = "run.device='gpu:software'";
+/// The device of [`super::kind`].
+pub fn lane() -> &'static str {
+    match super::kind() {
+        GpuKind::Hardware => "run.device='gpu'",
+        GpuKind::Software => "run.device='gpu:software'",
+    }
+}
+
 pub const CPU: &str = "run.device='cpu'";
 
 /// A folder with `vol.npy` of these voxels.
@@ -54,7 +61,7 @@ pub fn plan_with(
 
 /// A plan of a GPU run.
 pub fn plan(dir: &Path, text: &str, sets: &[&str]) -> Plan {
-    plan_with(dir, text, &[&[SOFTWARE], sets].concat(), Ok(found())).unwrap_or_else(|e| panic!("{e}")).0
+    plan_with(dir, text, &[&[lane()], sets].concat(), Ok(found())).unwrap_or_else(|e| panic!("{e}")).0
 }
 
 /// Device and reason of a stage.
