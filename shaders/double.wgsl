@@ -154,20 +154,33 @@ fn quotient_of(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     if y.bits.x == 0u && y.bits.y == SIGN {
         return joined(sign, x.exponent - y.exponent - 63, x.bits); // a power of two, as most counts are
     }
-    // A bit at a time; both operands have at most 53.
-    let divisor = right64(y.bits, 1u);
-    var rest = right64(x.bits, 2u);
+    // Both have at most 53 bits. A bit, then three digits of 18 bits, each guessed in f32 as in `digit` of integers64.wgsl. What is
+    // left is less than the divisor, so that it does not matter that products lose what is above 64 bits.
+    let divisor = right64(y.bits, 11u);
+    let inverse = 262144.0 / (f32(divisor.y) * 4294967296.0 + f32(divisor.x));
+    var rest = right64(x.bits, 11u);
     var q = vec2<u32>();
-    for (var i = 0; i < 58; i += 1) {
-        rest = left64(rest, 1u);
-        q = left64(q, 1u);
-        if !less64(rest, divisor) {
-            rest = minus64(rest, divisor);
-            q.x |= 1u;
-        }
+    if !less64(rest, divisor) {
+        rest = minus64(rest, divisor);
+        q.x = 1u;
     }
+    for (var i = 0; i < 3; i += 1) {
+        var guess = u32((f32(rest.y) * 4294967296.0 + f32(rest.x)) * inverse);
+        let product = times32(guess, divisor.x) + vec2<u32>(0u, guess * divisor.y);
+        rest = minus64(left64(rest, 18u), product);
+        if (rest.y & SIGN) != 0u {
+            guess -= 1u;
+            rest = plus64(rest, divisor);
+        }
+        if !less64(rest, divisor) {
+            guess += 1u;
+            rest = minus64(rest, divisor);
+        }
+        q = plus64(left64(q, 18u), vec2<u32>(guess, 0u));
+    }
+    q = left64(q, 2u);
     q.x |= select(0u, 1u, (rest.x | rest.y) != 0u);
-    return joined(sign, x.exponent - y.exponent - 57, q);
+    return joined(sign, x.exponent - y.exponent - 56, q);
 }
 
 fn root_of(a: vec2<u32>) -> vec2<u32> {

@@ -16,19 +16,19 @@ struct Taps {
     out_axis: u32,  // the output's
     out_i: u32,
     out_j: u32,
-    inner: u32,     // extents, the fastest first: of the outputs' x, and of their y
+    inner: u32,     // extents, the fastest first: of the outputs' x, and of their y; along the axis of strips
     middle: u32,
     axis: u32,      // which of z, y, x the axis is; i and j are the others in this order
-    weights: u32,   // where the axis' weights start
+    weights: u32,   // where the axis' weights start: of each step away those of all outputs
     packing: u32,   // log2 of voxels per word
     sign: u32,      // the sign bit of a packed voxel, or 0
     zero: u32,      // 0, which no compiler knows
     threads: u32,
     centres: u32,   // where the centres' weights of the axis start (variance)
     last: u32,      // 1: of a cell only the variance is kept
+    strip: u32,     // outputs of a thread, one after the other along the axis
     spare_0: u32,
     spare_1: u32,
-    spare_2: u32,
 }
 
 @group(0) @binding(0) var<uniform> p: Taps;
@@ -36,8 +36,8 @@ struct Taps {
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> weights: array<u32>;
 
-// Where an output's centre stands in the input, how many taps exist before and after it, where its weights start, its place
-// among the outputs along the axis, and its own.
+// Where the centre of a thread's first output stands in the input, how many taps exist before and after it, where its weights
+// start, its place among the outputs along the axis, and its own.
 struct Centre {
     here: u32,
     before: u32,
@@ -63,10 +63,11 @@ fn centre_of(thread: u32) -> Centre {
         i = z;
         j = y;
     }
+    k *= p.strip;
     let centre = p.at + k;
     let here = i * p.in_i + j * p.in_j + (centre - p.start) * p.in_axis;
     let place = k * p.out_axis + i * p.out_i + j * p.out_j;
-    return Centre(here, centre, p.n - 1u - centre, p.weights + k * p.radius, k, place);
+    return Centre(here, centre, p.n - 1u - centre, p.weights + k, k, place);
 }
 
 fn one(thread: u32, first_pass: bool) {

@@ -3,8 +3,8 @@
 //
 // Agrees with src/kernel/gaussian (variance_row) within facts::tolerance::VARIANCE.
 // Bindings, group 0: 0 uniform Taps; 1 storage, read: packed voxels (`first`) or cells (`next`); 2 storage, written: cells of
-// three words: mean (high, low), variance, of which the last pass keeps the variance; 3 storage, read: bits of f32 weights, `radius` for each output along the axis, and
-// one more for its centre. Workgroup: gaussian_taps.wgsl.
+// three words: mean (high, low), variance, of which the last pass keeps the variance; 3 storage, read: bits of f32 weights, for
+// each step away those of all outputs along the axis, and one more for each centre. Workgroup: gaussian_taps.wgsl.
 
 fn smooth_at(at: Centre, packed: bool) {
     let c = cell_at(at.here, packed);
@@ -17,12 +17,12 @@ fn smooth_at(at: Centre, packed: bool) {
         if d <= at.after {
             both += distance(cell_at(at.here + d * p.in_axis, packed).mean, c.mean);
         }
-        moved += bitcast<f32>(weights[at.weights + d - 1u]) * both;
+        moved += bitcast<f32>(weights[at.weights + (d - 1u) * p.m]) * both;
     }
     let mean = add(c.mean, alone(moved));
     var sum = vec2<f32>(spread(c, mean, bitcast<f32>(weights[p.centres + at.k])), 0.0);
     for (var d = 1u; d <= p.radius; d += 1u) {
-        let w = bitcast<f32>(weights[at.weights + d - 1u]);
+        let w = bitcast<f32>(weights[at.weights + (d - 1u) * p.m]);
         if d <= at.before {
             sum = add(sum, alone(spread(cell_at(at.here - d * p.in_axis, packed), mean, w)));
         }

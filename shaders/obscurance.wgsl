@@ -7,10 +7,17 @@
 //
 // Agrees bit for bit with src/kernel/obscurance (integer sums). Parameters: src/gpu/sweep.rs, struct Lines; displacements
 // are integers that the CPU made in f64, and are never computed here.
-// Bindings, group 0: 0 uniform Lines; 1 storage, read: packed codes; 2 storage, read and written: sums of the output box;
-// 3 storage, read: displacements and contributions; 4 storage, read and written: steps to the next greater code of both
-// senses, 16 bits each, 0 for none, [plane][thread].
-// Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no atomics: a voxel has one thread.
+// A dispatch takes up to four families side by side, since the lines of one are too few to fill a large GPU; integers add up
+// to the same sums in any order, so they are added by atomic operations. What a thread left at a voxel (an entry: its code, and
+// the steps to the next greater one) stands in one place of the links, first of the backward sense, then of the forward one.
+// The last `RING` planes' entries stand in workgroup memory, too, where most answers are found; each thread reads what it
+// wrote itself, so there is no barrier.
+//
+// A shader adds the type `Entry`, its `entry_of`, `code_of` and `step_of`, and `RING`.
+// Bindings, group 0: 0 uniform Lines; 1 storage, read: packed codes; 2 storage, read and written: sums of the output box, which
+// start at 0; 3 storage, read: displacements and contributions; 4 storage, read and written: entries of each family,
+// [plane][thread].
+// Workgroup: 64 x 1 x 1, groups counted over x, then y. A group is of one family.
 
 struct Lines {
     planes: u32,     // extent of the box along the dominant axis
@@ -35,27 +42,32 @@ struct Lines {
     backward: u32,   // toward falling planes; 0xffffffff: a sense that is not swept
     packing: u32,    // log2 of codes per word
     first: u32,      // line of thread 0
-    threads: u32,
-    fresh: u32,      // 1: the sums start here
+    threads: u32,    // lines of this dispatch
+    links: u32,      // the family's first entry
+    groups: u32,     // workgroups of each family
     spare_0: u32,
     spare_1: u32,
     spare_2: u32,
-    spare_3: u32,
 }
 
-@group(0) @binding(0) var<uniform> p: Lines;
+@group(0) @binding(0) var<uniform> families: array<Lines, 4>;
 @group(0) @binding(1) var<storage, read> codes: array<u32>;
-@group(0) @binding(2) var<storage, read_write> sums: array<u32>;
+@group(0) @binding(2) var<storage, read_write> sums: array<atomic<u32>>;
 @group(0) @binding(3) var<storage, read> tables: array<u32>;
-@group(0) @binding(4) var<storage, read_write> links: array<u32>;
+@group(0) @binding(4) var<storage, read_write> links: array<Entry>;
 
 const NOT_SWEPT: u32 = 0xffffffffu;
+
+var<private> p: Lines;
+// Of each thread the entries of the planes that it was at last, by their number modulo `RING`.
+var<workgroup> ring: array<Entry, RING * 64u>;
 
 fn code(plane: u32, at: vec2<i32>) -> u32 {
     let index = p.code_at + plane * p.code_a + u32(at.x) * p.code_b + u32(at.y) * p.code_c;
     return unpacked(codes[index >> p.packing], index, p.packing);
 }
 
+// The way from the plane before to this one.
 fn shift(plane: u32) -> vec2<i32> {
     return vec2<i32>(bitcast<i32>(tables[p.shifts + plane]), bitcast<i32>(tables[p.shifts + p.planes + plane]));
 }
@@ -70,25 +82,34 @@ fn move_by(at: vec2<i32>, by: vec2<i32>) -> vec3<i32> {
     return vec3<i32>(moved + low - high, select(1, 0, inside));
 }
 
-// Steps from `plane` to the first greater code, no more than `room` planes away; 0 if there is none. `half` tells where the
-// links of this sense stand, `way` its direction.
-fn seek(plane: u32, at: vec2<i32>, room: u32, thread: u32, half: u32, way: i32) -> u32 {
-    let own = code(plane, at);
-    let here = shift(plane);
+fn place_of(plane: u32, thread: u32) -> u32 {
+    return p.links + plane * p.threads + thread;
+}
+
+fn leave(plane: u32, thread: u32, local: u32, entry: Entry) {
+    links[place_of(plane, thread)] = entry;
+    ring[(plane % RING) * 64u + local] = entry;
+}
+
+// Steps from `plane` to the first greater code than `own`, no more than `room` planes away; 0 if there is none.
+fn seek(plane: u32, own: u32, room: u32, thread: u32, local: u32, way: i32) -> u32 {
     var d = 1u;
-    loop {
-        if d > room {
-            return 0u;
-        }
+    while d <= room {
         let other = u32(i32(plane) + way * i32(d));
-        if code(other, at + shift(other) - here) > own {
+        var entry: Entry;
+        if d <= RING {
+            entry = ring[(other % RING) * 64u + local];
+        } else {
+            entry = links[place_of(other, thread)];
+        }
+        if code_of(entry) > own {
             return d;
         }
-        let link = (links[other * p.threads + thread] >> half) & 0xffffu;
-        if link == 0u {
+        let step = step_of(entry);
+        if step == 0u {
             return 0u;
         }
-        d += link;
+        d += step;
     }
     return 0u;
 }
@@ -97,57 +118,82 @@ fn contribution(table: u32, d: u32) -> u32 {
     return tables[table + select(d - 1u, p.reach, d == 0u)];
 }
 
+fn add_up(plane: u32, at: vec2<i32>, sum: u32) {
+    let out = vec3<i32>(i32(plane) - p.at_a, at.x - p.at_b, at.y - p.at_c);
+    if all(out >= vec3<i32>(0)) && all(out < vec3<i32>(i32(p.out_a), i32(p.out_b), i32(p.out_c))) {
+        atomicAdd(&sums[u32(out.x) * p.sum_a + u32(out.y) * p.sum_b + u32(out.z) * p.sum_c], sum);
+    }
+}
+
+// To the last plane, seeking backward on the way; returns the place there. The code of the next plane is asked for before this
+// one's answer is sought, so that it is there when it is needed.
+fn go(start: vec2<i32>, thread: u32, local: u32) -> vec2<i32> {
+    var at = start;
+    var own = code(0u, at);
+    var room = 0u; // planes of this line that lie behind
+    for (var i = 0u; i < p.planes; i += 1u) {
+        var next = vec3<i32>(at, 0);
+        var ahead = 0u;
+        if i + 1u < p.planes {
+            next = move_by(at, shift(i + 1u));
+            ahead = code(i + 1u, next.xy);
+        }
+        var d = 0u;
+        if p.backward != NOT_SWEPT {
+            d = seek(i, own, min(room, p.reach), thread, local, -1);
+        }
+        leave(i, thread, local, entry_of(own, d));
+        room = select(room + 1u, 0u, next.z == 1);
+        at = next.xy;
+        own = ahead;
+    }
+    return at;
+}
+
+// And back, seeking forward and adding up both.
+fn come(end: vec2<i32>, thread: u32, local: u32) {
+    var at = end;
+    var here = links[place_of(p.planes - 1u, thread)];
+    var room = 0u;
+    for (var k = p.planes; k > 0u; k -= 1u) {
+        let i = k - 1u;
+        var next = vec3<i32>(at, 0);
+        var ahead = here;
+        if i > 0u {
+            next = move_by(at, -shift(i));
+            ahead = links[place_of(i - 1u, thread)];
+        }
+        let own = code_of(here);
+        var sum = 0u;
+        if p.backward != NOT_SWEPT {
+            sum = contribution(p.backward, step_of(here));
+        }
+        if p.forward != NOT_SWEPT {
+            let d = seek(i, own, min(room, p.reach), thread, local, 1);
+            leave(i, thread, local, entry_of(own, d));
+            sum += contribution(p.forward, d);
+        }
+        add_up(i, at, sum);
+        room = select(room + 1u, 0u, next.z == 1);
+        at = next.xy;
+        here = ahead;
+    }
+}
+
 @compute @workgroup_size(64)
 fn sweep(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
          @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
+    let number = group.y * groups.x + group.x;
+    let family = number / families[0].groups;
+    if family > 3u {
+        return;
+    }
+    p = families[family];
+    let thread = (number % p.groups) * 64u + local;
     if thread >= p.threads {
         return;
     }
     let line = p.first + thread;
-    var at = vec2<i32>(i32(line / p.size_c), i32(line % p.size_c));
-    // To the last plane, seeking backward on the way; `room` counts the planes of this line that lie behind.
-    var room = 0u;
-    for (var i = 0u; i < p.planes; i += 1u) {
-        if i > 0u {
-            let moved = move_by(at, shift(i) - shift(i - 1u));
-            at = moved.xy;
-            room = select(room + 1u, 0u, moved.z == 1);
-        }
-        var d = 0u;
-        if p.backward != NOT_SWEPT {
-            d = seek(i, at, min(room, p.reach), thread, 0u, -1);
-        }
-        links[i * p.threads + thread] = d;
-    }
-    // And back, seeking forward and adding up both.
-    room = 0u;
-    for (var k = p.planes; k > 0u; k -= 1u) {
-        let i = k - 1u;
-        if k < p.planes {
-            let moved = move_by(at, shift(i) - shift(k));
-            at = moved.xy;
-            room = select(room + 1u, 0u, moved.z == 1);
-        }
-        let place = i * p.threads + thread;
-        let behind = links[place];
-        var sum = 0u;
-        if p.backward != NOT_SWEPT {
-            sum = contribution(p.backward, behind);
-        }
-        if p.forward != NOT_SWEPT {
-            let d = seek(i, at, min(room, p.reach), thread, 16u, 1);
-            links[place] = behind | (d << 16u);
-            sum += contribution(p.forward, d);
-        }
-        let out = vec3<i32>(i32(i) - p.at_a, at.x - p.at_b, at.y - p.at_c);
-        if all(out >= vec3<i32>(0)) && all(out < vec3<i32>(i32(p.out_a), i32(p.out_b), i32(p.out_c))) {
-            let to = u32(out.x) * p.sum_a + u32(out.y) * p.sum_b + u32(out.z) * p.sum_c;
-            if p.fresh == 1u {
-                sums[to] = sum;
-            } else {
-                sums[to] += sum;
-            }
-        }
-    }
+    let end = go(vec2<i32>(i32(line / p.size_c), i32(line % p.size_c)), thread, local);
+    come(end, thread, local);
 }

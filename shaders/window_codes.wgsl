@@ -1,11 +1,11 @@
 // From exact sums and extremes of windows of small integers to results: statistics in f64 (double.wgsl), openness in f32
-// (estimators.wgsl), one plane per channel. One thread makes all channels of one voxel.
+// (estimators.wgsl), one plane per channel.
 //
 // Agrees bit for bit in statistics with src/kernel/window (estimate.rs, emit.rs), in openness within facts::tolerance. Parameters:
 // src/gpu/finish.rs, struct Codes.
 // Bindings, group 0: 0 uniform Codes; 1 storage, read: packed voxels; 2 storage, written: bits of f32 results; 3 storage,
 // read: extremes of codes (window_extremes.wgsl); 4 storage, read: sums of codes; 5 storage, read: sums of their squares. What
-// no channel needs may be anything.
+// no channel needs may be anything. One thread makes `STRIP` voxels along y.
 // Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no atomics: an output has one writer.
 
 struct Codes {
@@ -32,11 +32,17 @@ struct Codes {
     flipped: u32,   // 1: smaller is denser
     scaled: u32,    // 1: results are of slope * v + intercept
     threads: u32,
-    needs: u32,     // 1: sums of codes are there, 2: of squares, 4: extremes; 8: means are asked for, 16: variances
-    slope: vec2<u32>, // f64
+    needs: u32,     // 1: sums of codes are there, 2: of squares, 4: extremes; 8: means are asked for in f64, 16: variances
+    whole: u32,     // voxels of a whole window
+    strips: u32,    // of `STRIP` rows, in a plane
+    share: vec2<u32>, // f64: 1 / whole
+    slope: vec2<u32>,
     intercept: vec2<u32>,
     channels: array<vec4<u32>, 4>, // what each is, and 256 where constant windows are half open
 }
+
+// Divisions that find a thread's place cost as much as a voxel.
+const STRIP: u32 = 4u;
 
 @group(0) @binding(0) var<uniform> p: Codes;
 @group(0) @binding(1) var<storage, read> voxels: array<u32>;
@@ -142,12 +148,44 @@ fn of_difference(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     return of_integer(minus64(a, b));
 }
 
+// The f32 nearest to d / n, half to even, of a positive integer and a count below 2^28: between a quotient of such a count and
+// a number halfway between two f32 lie more than 2^-53 of it, so that rounding to f64 first would change nothing.
+fn nearest(d: vec2<u32>, n: u32) -> u32 {
+    if (d.x | d.y) == 0u {
+        return 0u;
+    }
+    let by_d = zeros64(d);
+    let by_n = countLeadingZeros(n);
+    let half = divided(right64(left64(d, by_d), 1u), n << by_n);
+    let top = countLeadingZeros(half.quotient); // 0 or 1
+    let m = (half.quotient << top) | select(0u, 1u, half.rest != 0u);
+    var kept = m >> 8u;
+    let rest = m & 255u;
+    if rest > 128u || (rest == 128u && (kept & 1u) == 1u) {
+        kept += 1u;
+    }
+    // The leading bit adds one to the exponent.
+    return kept + ((158u + by_n - by_d - top) << 23u);
+}
+
+// The mean of values that are not scaled, as f32.
+fn plain_mean(w: Window) -> u32 {
+    let shift = times32(w.n, p.flip);
+    if less64(w.s1, shift) {
+        return SIGN | nearest(minus64(shift, w.s1), w.n);
+    }
+    return nearest(minus64(w.s1, shift), w.n);
+}
+
 fn mean(w: Window) -> vec2<u32> {
     return scaled(quotient_of(of_difference(w.s1, times32(w.n, p.flip)), of_integer(vec2<u32>(w.n, 0u))));
 }
 
 fn variance(w: Window) -> vec2<u32> {
-    let inverse = quotient_of(ONE, of_integer(vec2<u32>(w.n, 0u)));
+    var inverse = p.share;
+    if w.n != p.whole {
+        inverse = quotient_of(ONE, of_integer(vec2<u32>(w.n, 0u)));
+    }
     return product_of(product_of(w.numerator, inverse), inverse);
 }
 
@@ -162,6 +200,12 @@ fn single(v: vec2<u32>) -> f32 {
     return bitcast<f32>(narrowed(v));
 }
 
+// a - b >= 0 as f32; rounded once where it has 32 bits, else nearly so.
+fn single_of(a: vec2<u32>, b: vec2<u32>) -> f32 {
+    let d = minus64(a, b);
+    return f32(d.y) * 4294967296.0 + f32(d.x);
+}
+
 fn openness(w: Window, kind: u32, half: bool) -> f32 {
     let constant = select(1.0, 0.5, half);
     let turned = p.flipped == 1u;
@@ -171,8 +215,8 @@ fn openness(w: Window, kind: u32, half: bool) -> f32 {
         }
         let below = f32(w.v - w.lo);
         let above = f32(w.hi - w.v);
-        let over = single(of_integer(minus64(w.s1, times32(w.n, w.lo))));
-        let under = single(of_integer(minus64(times32(w.n, w.hi), w.s1)));
+        let over = single_of(w.s1, times32(w.n, w.lo));
+        let under = single_of(times32(w.n, w.hi), w.s1);
         if turned {
             return power(above, below, f32(w.hi - w.lo), under, over);
         }
@@ -186,13 +230,23 @@ fn openness(w: Window, kind: u32, half: bool) -> f32 {
 }
 
 fn extreme(code: u32) -> u32 {
+    if p.scaled == 0u {
+        return bitcast<u32>(f32(i32(code) - i32(p.flip)));
+    }
     return narrowed(scaled(of_difference(vec2<u32>(code, 0u), vec2<u32>(p.flip, 0u))));
+}
+
+fn is_plain(w: Window) -> bool {
+    return p.scaled == 0u && w.n < 0x10000000u;
 }
 
 fn result(w: Window, channel: u32) -> u32 {
     let negative = p.scaled == 1u && (p.slope.y & SIGN) != 0u;
     switch channel & 255u {
         case 0u: {
+            if is_plain(w) {
+                return plain_mean(w);
+            }
             return narrowed(w.mean);
         }
         case 1u, 2u: {
@@ -225,27 +279,34 @@ fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
         return;
     }
     let x = thread % p.out_x;
-    let y = (thread / p.out_x) % p.out_y;
-    let z = thread / (p.out_x * p.out_y);
+    let first = (thread / p.out_x) % p.strips * STRIP;
+    let z = thread / (p.out_x * p.strips);
+    for (var y = first; y < min(first + STRIP, p.out_y); y += 1u) {
+        finish_at(z, y, x);
+    }
+}
+
+fn finish_at(z: u32, y: u32, x: u32) {
+    let voxel = (z * p.out_y + y) * p.out_x + x;
     let index = p.centre + z * p.in_z + y * p.in_y + x;
     var w = Window();
     w.v = unpacked(voxels[index >> p.packing], index, p.packing) ^ p.flip;
     w.n = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_y + y, p.radius_y, p.size_y)
         * along(p.at_x + x, p.radius_x, p.size_x);
     if (p.needs & 4u) != 0u {
-        w.lo = extremes[thread] & 0xffffu;
-        w.hi = extremes[thread] >> 16u;
+        w.lo = extremes[voxel] & 0xffffu;
+        w.hi = extremes[voxel] >> 16u;
     }
     if (p.needs & 1u) != 0u {
-        w.s1 = vec2<u32>(sums[thread], 0u);
+        w.s1 = vec2<u32>(sums[voxel], 0u);
         if (p.wide & 1u) != 0u {
-            w.s1 = vec2<u32>(sums[2u * thread], sums[2u * thread + 1u]);
+            w.s1 = vec2<u32>(sums[2u * voxel], sums[2u * voxel + 1u]);
         }
     }
     if (p.needs & 2u) != 0u {
-        w.s2 = vec2<u32>(squares[thread], 0u);
+        w.s2 = vec2<u32>(squares[voxel], 0u);
         if (p.wide & 2u) != 0u {
-            w.s2 = vec2<u32>(squares[2u * thread], squares[2u * thread + 1u]);
+            w.s2 = vec2<u32>(squares[2u * voxel], squares[2u * voxel + 1u]);
         }
         w.numerator = numerator(w);
     }
@@ -256,6 +317,6 @@ fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
         w.variance = variance(w);
     }
     for (var c = 0u; c < p.count; c += 1u) {
-        output[c * p.stride + thread] = result(w, p.channels[c / 4u][c % 4u]);
+        output[c * p.stride + voxel] = result(w, p.channels[c / 4u][c % 4u]);
     }
 }

@@ -7,6 +7,8 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: bits of f32 (`first`) or cells (`next`); 2 storage, read and written:
 // cells of `cell` words: voxels, mean (high, low), and where `square` is 1 M2 (high, low). Workgroup: window_pass.wgsl.
 
+const COLUMNS: u32 = 4u;
+
 struct Seen {
     n: u32,
     mean: vec2<f32>,

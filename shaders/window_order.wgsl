@@ -5,6 +5,8 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: bits of f32 (`first`) or words of pairs (`next`); 2 storage, read and
 // written: pairs, least and greatest. Workgroup: window_pass.wgsl.
 
+const COLUMNS: u32 = 16u;
+
 alias Seen = vec2<u32>;
 
 fn nothing() -> Seen {

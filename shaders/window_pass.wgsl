@@ -1,8 +1,8 @@
 // What the passes over windows share: their parameters, and which part of which line a thread takes. A
-// shader adds `walk`, which makes the outputs of one block of one line.
+// shader adds `walk`, which makes the outputs of one block of one line; lines along x go by tiles (window_tiles.wgsl).
 //
-// Parameters: src/gpu/passes.rs, struct Pass. Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no
-// atomics: an output has one writer.
+// Parameters: src/gpu/passes.rs, struct Pass. Workgroup: 64 x 1 x 1, groups counted over x, then y. No atomics: an output has
+// one writer at a time.
 
 struct Pass {
     n: u32,         // extent of the input along the axis
@@ -15,10 +15,9 @@ struct Pass {
     out_axis: u32,  // the output's
     out_i: u32,
     out_j: u32,
-    lines: u32,     // extent of the line index i
+    lines: u32,     // extent of the line index i; along x all rows
     blocks: u32,    // blocks per line
-    block: u32,     // outputs per block
-    along: u32,     // 1: neighbouring threads take neighbouring blocks of a line (x), 0: neighbouring lines
+    block: u32,     // outputs per block; along x those of a span
     packing: u32,   // log2 of voxels per word
     flip: u32,      // XOR that turns stored bits into codes
     square: u32,    // 1: the first pass sums squares of codes; cells of moments hold M2
@@ -29,6 +28,7 @@ struct Pass {
     spare_0: u32,
     spare_1: u32,
     spare_2: u32,
+    spare_3: u32,
 }
 
 @group(0) @binding(0) var<uniform> p: Pass;
@@ -41,12 +41,8 @@ struct Line {
 }
 
 fn line_of(thread: u32) -> Line {
-    var i = thread % p.lines;
-    var b = (thread / p.lines) % p.blocks;
-    if p.along == 1u {
-        b = thread % p.blocks;
-        i = (thread / p.blocks) % p.lines;
-    }
+    let i = thread % p.lines;
+    let b = (thread / p.lines) % p.blocks;
     let j = thread / (p.lines * p.blocks);
     return Line(i * p.in_i + j * p.in_j, i * p.out_i + j * p.out_j, i32(b));
 }

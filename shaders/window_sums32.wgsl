@@ -4,6 +4,8 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: packed codes (`first`) or sums (`next`); 2 storage, written: sums.
 // Workgroup: window_pass.wgsl.
 
+const COLUMNS: u32 = 32u;
+
 alias Sum = u32;
 
 fn plus(a: Sum, b: Sum) -> Sum {

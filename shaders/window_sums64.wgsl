@@ -4,6 +4,8 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: packed codes (`first`) or words of pairs of sums (`next`); 2 storage,
 // written: pairs. Workgroup: window_pass.wgsl.
 
+const COLUMNS: u32 = 16u;
+
 alias Sum = vec2<u32>;
 
 fn plus(a: Sum, b: Sum) -> Sum {

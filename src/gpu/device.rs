@@ -12,7 +12,7 @@ pub struct Device {
     pub device: wgpu::Device,
     pub queue: wgpu::Queue,
     /// By shader, in the order of [`Shader::ALL`], and entry point; made when they are first used.
-    kernels: Vec<[OnceLock<Kernel>; 2]>,
+    kernels: Vec<[OnceLock<Kernel>; 3]>,
     /// Nanoseconds of a tick of the time stamps, where they were asked for and there are any.
     pub tick: Option<f64>,
     slots: Mutex<Vec<Slot>>,
@@ -128,16 +128,26 @@ fn kernel(device: &wgpu::Device, shader: Shader, entry_point: usize) -> Kernel {
         bind_group_layouts: &[Some(&layout)],
         immediate_size: 0,
     });
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some(name),
-        source: wgpu::ShaderSource::Wgsl(shader.text().into()),
-    });
+    let source = wgpu::ShaderSource::Wgsl(shader.text().into());
+    let module = wgpu::ShaderModuleDescriptor { label: Some(name), source };
+    // What indices reach beyond a buffer stays checked.
+    // SAFETY: every loop of the shaders counts up or down to a bound that does not change in it (`seek` steps by at least one),
+    // so none is endless; every divisor is a constant or an extent or count of the parameters, which `Recording::fault` and
+    // the recorders keep above 0; there are no rays and no meshes.
+    let module = unsafe {
+        let checks = wgpu::ShaderRuntimeChecks { bounds_checks: true, ..wgpu::ShaderRuntimeChecks::all(false) };
+        device.create_shader_module_trusted(module, checks)
+    };
     let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(name),
         layout: Some(&shared),
         module: &module,
         entry_point: Some(shader.entries()[entry_point]),
-        compilation_options: wgpu::PipelineCompilationOptions::default(),
+        // Nothing in workgroup memory is read before it is written.
+        compilation_options: wgpu::PipelineCompilationOptions {
+            zero_initialize_workgroup_memory: false,
+            ..Default::default()
+        },
         cache: None,
     });
     Kernel { layout, pipeline }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::backend;
 use super::device::{self, Device, SlotGuard};
 use super::facts::{GpuFacts, GpuKind};
-use super::record::{Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Recording, STAMP_BYTES, STAMPS, groups};
+use super::record::{Command, Dispatch, PARAMS_STRIDE, Recording, STAMP_BYTES, STAMPS, groups};
 use super::recorder::Recorder;
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
@@ -392,7 +392,7 @@ fn encode(
             Command::Copy { from, to, bytes } => {
                 encoder.copy_buffer_to_buffer(slot.of(*from), 0, slot.of(*to), 0, *bytes);
             }
-            Command::Clear(buffer) => encoder.clear_buffer(slot.of(*buffer), 0, Some(FLAG_BYTES)),
+            Command::Clear(buffer, bytes) => encoder.clear_buffer(slot.of(*buffer), 0, Some(*bytes)),
             Command::Dispatch(_) => {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 for command in run {

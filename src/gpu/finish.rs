@@ -11,6 +11,11 @@ use crate::stage::{Method, Ties, WindowChannel, WindowParams};
 /// Most channels of one dispatch.
 pub const MOST: usize = 16;
 
+/// Rows of voxels of a thread; the shader's `STRIP`.
+const STRIP: usize = 4;
+/// Voxels of windows from which on means go through f64; the shader's `is_plain`.
+const NEAREST: u64 = 1 << 28;
+
 /// What the dispatch does; `struct Finish` of `shaders/window_finish.wgsl`, which explains the fields.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
@@ -49,6 +54,9 @@ pub struct Codes {
     pub scaled: u32,
     pub threads: u32,
     pub needs: u32,
+    pub whole: u32,
+    pub strips: u32,
+    pub share: [u32; 2],
     pub slope: [u32; 2],
     pub intercept: [u32; 2],
     pub channels: [u32; MOST],
@@ -128,6 +136,12 @@ impl Channels {
         }
         let wide = |squares: bool| made.iter().any(|(q, _)| *q == Quantity::Sum { square: squares, wide: true });
         let bits = |v: f64| [v.to_bits() as u32, (v.to_bits() >> 32) as u32];
+        let whole: usize = job.radius.iter().map(|r| 2 * r + 1).product();
+        // One division for all windows that are whole.
+        let scaled = !self.affine.is_identity();
+        let mean = self.asks(&[5]) || self.asks(&[0]) && (scaled || job.count() >= NEAREST);
+        let strips = part.dst[1].div_ceil(STRIP);
+        let threads = (part.dst[0] * strips * part.dst[2]) as u32;
         let codes = Codes {
             out: [part.dst[1] as u32, part.dst[2] as u32],
             centre: centre as u32,
@@ -147,13 +161,16 @@ impl Channels {
             count: self.count as u32,
             stride: planes.stride,
             flipped: self.flipped as u32,
-            scaled: !self.affine.is_identity() as u32,
+            scaled: scaled as u32,
             threads,
             needs: job.needs.mean as u32
                 + 2 * job.needs.variance as u32
                 + 4 * job.needs.extremes as u32
-                + 8 * self.asks(&[0, 5]) as u32
+                + 8 * mean as u32
                 + 16 * self.asks(&[3, 4, 5]) as u32,
+            whole: u32::try_from(whole).unwrap_or(0),
+            strips: strips as u32,
+            share: bits(1.0 / whole as f64),
             slope: bits(self.affine.slope),
             intercept: bits(self.affine.intercept),
             channels: self.codes,

@@ -144,7 +144,7 @@ impl Arithmetic {
             let (a, b) = (strides(from), strides(shape));
             let mut line = vec![Cell::default(); shape[axis]];
             for (u, v) in (0..shape[i]).flat_map(|u| (0..shape[j]).map(move |v| (u, v))) {
-                for block in 0..pass.blocks as i64 {
+                for block in 0..(pass.m + pass.phase).div_ceil(pass.window) as i64 {
                     let at = |q: i64| cells[u * a[i] + v * a[j] + q as usize * a[axis]];
                     self.walk(pass, block, at, &mut line);
                 }

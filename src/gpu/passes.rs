@@ -2,7 +2,7 @@
 //! shared by planner and engine.
 
 use super::finish::Channels;
-use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::record::{Bind, Buffer, GROUP, Recording, Shader, Sizes};
 use super::recorder::{Planes, Recorder};
 use crate::grid::{DType, Shape};
 use crate::kernel::window::Needs;
@@ -25,7 +25,6 @@ pub struct Pass {
     pub lines: u32,
     pub blocks: u32,
     pub block: u32,
-    pub along: u32,
     pub packing: u32,
     pub flip: u32,
     pub square: u32,
@@ -33,8 +32,12 @@ pub struct Pass {
     pub phase: u32,
     pub zero: u32,
     pub cell: u32,
-    pub spare: [u32; 3],
+    pub spare: [u32; 4],
 }
+
+/// Outputs along x that a workgroup makes of a row, or as many whole blocks as they hold: what it reads beyond them is a sixth of
+/// them at radius 10.
+const SPAN: u32 = 128;
 
 /// A quantity that the device makes for every window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -192,7 +195,12 @@ impl Job {
         let axis = |a: usize| {
             let window = 2 * self.radius[a] as u32 + 1;
             let (n, m) = (part.src[a] as u32, part.dst[a] as u32);
-            let block = if matches!(quantity, Quantity::Sum { .. }) { window.max(32) } else { window };
+            let block = match (quantity, a) {
+                (Quantity::Sum { .. }, 0 | 1) => window.max(32),
+                (Quantity::Sum { .. }, _) => window.max(SPAN),
+                (_, 0 | 1) => window,
+                _ => window * (SPAN / window).max(1),
+            };
             let start = (self.at[a] + part.lo[a]) as i64 - self.radius[a] as i64 - part.from[a] as i64;
             let phase = match quantity {
                 Quantity::Moments { .. } => {
@@ -218,28 +226,16 @@ impl Job {
         };
         let y =
             Pass { in_axis: nx, in_i: 1, in_j: ny * nx, out_axis: nx, out_i: 1, out_j: my * nx, lines: nx, ..axis(1) };
-        let x = Pass {
-            in_axis: 1,
-            in_i: nx,
-            in_j: my * nx,
-            out_axis: 1,
-            out_i: mx,
-            out_j: my * mx,
-            lines: my,
-            along: 1,
-            ..axis(2)
-        };
+        let x = Pass { in_axis: 1, in_i: nx, out_axis: 1, out_i: mx, lines: my * mz, ..axis(2) };
         debug_assert!(nz > 0 && mz > 0);
         let (square, words) = match quantity {
             Quantity::Moments { square } => (square, cell(square)),
             Quantity::Sum { square, .. } => (square, 0),
             _ => (false, 0),
         };
-        let shared = |p: Pass, lines: u32| {
-            let threads = p.blocks * p.lines * lines;
-            Pass { threads, square: square as u32, cell: words as u32, ..p }
-        };
-        [shared(z, ny), shared(y, mz), shared(x, mz)]
+        let shared = |p: Pass, threads: u32| Pass { threads, square: square as u32, cell: words as u32, ..p };
+        let each = |p: Pass, lines: u32| shared(p, p.blocks * p.lines * lines);
+        [each(z, ny), each(y, mz), shared(x, x.blocks * x.lines.div_ceil(GROUP) * GROUP)]
     }
 
     /// Every quantity of a part, then what comes back, one quantity after the other; or what the device makes of all of
@@ -290,7 +286,7 @@ impl Job {
             let [a, b, last] = [a, b, last].map(Bind::from);
             for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
                 let bind = [[from, a], [a, b], [b, last]][axis];
-                to.dispatch(shader, (axis > 0) as usize, &pass, &bind, pass.threads);
+                to.dispatch(shader, axis, &pass, &bind, pass.threads);
             }
             to.give(a.buffer);
             to.give(b.buffer);
@@ -448,8 +444,9 @@ mod tests {
             assert_eq!(recording.fault(), None);
             for (a, pass) in job.passes(&part, Quantity::Moments { square: true }).iter().enumerate() {
                 let first = job.place[a] + part.lo[a] as i64 - 4 - pass.phase as i64;
-                assert!(pass.phase < 9 && first.rem_euclid(9) == 0);
-                assert!(pass.blocks * 9 >= pass.m + pass.phase && (pass.blocks - 1) * 9 < pass.m + pass.phase);
+                assert!(pass.phase < 9 && first.rem_euclid(9) == 0 && pass.block % 9 == 0);
+                let ends = pass.m + pass.phase;
+                assert!(pass.blocks * pass.block >= ends && (pass.blocks - 1) * pass.block < ends);
             }
         }
     }

@@ -3,8 +3,9 @@
 
 pub use super::shaders::Shader;
 
-/// Bytes between the parameters of dispatches in their buffer (the largest alignment that an adapter may ask for).
-pub const PARAMS_STRIDE: u64 = 256;
+/// Bytes between the parameters of dispatches in their buffer, which are at most as many (a multiple of the largest alignment
+/// that an adapter may ask for, 256).
+pub const PARAMS_STRIDE: u64 = 512;
 /// Most time stamps of a part, and room for them behind the results.
 pub const STAMPS: usize = 256;
 pub const STAMP_BYTES: u64 = 8 * STAMPS as u64;
@@ -63,8 +64,8 @@ pub struct Readback {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Command {
     Dispatch(Dispatch),
-    /// Zeros in the first [`FLAG_BYTES`] of a buffer.
-    Clear(Buffer),
+    /// Zeros in so many first bytes of a buffer.
+    Clear(Buffer, u64),
     /// From the start of one buffer to the start of another.
     Copy {
         from: Buffer,
@@ -74,7 +75,7 @@ pub enum Command {
     Readback(Readback),
 }
 
-/// Bytes that [`Command::Clear`] clears.
+/// Bytes of a flag.
 pub const FLAG_BYTES: u64 = 256;
 
 /// All that the device does with one part.
@@ -104,8 +105,10 @@ impl Recording {
         }
         self.commands.iter().find_map(|command| match command {
             Command::Dispatch(d) => self.dispatch_fault(d),
-            Command::Clear(b) if self.sizes.of(*b) < FLAG_BYTES => Some(format!("{b:?} has nothing to clear")),
-            Command::Clear(_) => None,
+            Command::Clear(b, bytes) => {
+                let wrong = self.sizes.of(*b) < *bytes || bytes % 4 != 0;
+                wrong.then(|| format!("{bytes} bytes of {b:?} are cleared"))
+            }
             Command::Copy { from, to, bytes } => {
                 let wrong = from == to || [from, to].iter().any(|b| *bytes > self.sizes.of(**b));
                 wrong.then(|| format!("a copy of {bytes} bytes from {from:?} to {to:?}"))
@@ -213,7 +216,7 @@ mod tests {
     fn faults_are_seen() {
         let mut work = [0; WORK];
         work[0] = 512;
-        let sizes = Sizes { params: 256, tables: 256, source: 256, work, read: 512 };
+        let sizes = Sizes { params: PARAMS_STRIDE, tables: 256, source: 256, work, read: 512 };
         let a = Buffer::Work(0);
         let dispatch = |bind: &[Buffer]| {
             let (shader, params) = (Shader::Sums32, vec![0; 80]);
@@ -222,13 +225,16 @@ mod tests {
         };
         let back = |from, bytes| Command::Readback(Readback { from: Bind { buffer: a, from }, bytes, to: 0 });
         let of = |commands: Vec<Command>| Recording { sizes, tables: vec![], commands }.fault();
-        assert_eq!(of(vec![dispatch(&[Buffer::Source, a]), Command::Clear(a), back(0, 512), back(256, 256)]), None);
+        assert_eq!(
+            of(vec![dispatch(&[Buffer::Source, a]), Command::Clear(a, 512), back(0, 512), back(256, 256)]),
+            None
+        );
         assert!(of(vec![dispatch(&[a, a])]).is_some());
         assert!(of(vec![dispatch(&[a])]).is_some());
         assert!(of(vec![dispatch(&[a, Buffer::Tables])]).is_some());
         assert!(of(vec![dispatch(&[Buffer::Source, Buffer::Work(1)])]).is_some(), "a buffer of no bytes");
         assert!(of(vec![back(0, 516)]).is_some() && of(vec![back(256, 260)]).is_some());
-        assert!(of(vec![Command::Clear(Buffer::Work(1))]).is_some());
+        assert!(of(vec![Command::Clear(Buffer::Work(1), 4)]).is_some());
         let copy = |from, to, bytes| of(vec![Command::Copy { from, to, bytes }]);
         assert_eq!(copy(Buffer::Source, a, 256), None);
         assert!(copy(a, a, 256).is_some() && copy(Buffer::Source, a, 512).is_some());

@@ -61,10 +61,15 @@ impl Recorder {
         self.recording.commands.push(Command::Dispatch(dispatch));
     }
 
+    /// Zeros in so many first bytes of a buffer, a whole number of words.
+    pub fn clear(&mut self, buffer: Buffer, bytes: u64) {
+        self.recording.commands.push(Command::Clear(buffer, bytes));
+    }
+
     /// A buffer whose first words are 0.
     pub fn flag(&mut self) -> Buffer {
         let flag = self.take(FLAG_BYTES);
-        self.recording.commands.push(Command::Clear(flag));
+        self.clear(flag, FLAG_BYTES);
         flag
     }
 

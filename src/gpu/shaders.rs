@@ -22,7 +22,10 @@ pub enum Shader {
     Extremes,
     Sums32,
     Sums64,
+    /// Of codes of 8 and 16 bits.
     Obscurance,
+    /// Of codes of 32 bits.
+    ObscuranceWide,
     Gaussian,
     Gradient,
     Order,
@@ -41,11 +44,12 @@ pub enum Shader {
 }
 
 impl Shader {
-    pub const ALL: [Shader; 19] = [
+    pub const ALL: [Shader; 20] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
         Shader::Obscurance,
+        Shader::ObscuranceWide,
         Shader::Gaussian,
         Shader::Gradient,
         Shader::Order,
@@ -66,18 +70,63 @@ impl Shader {
     fn composed(self) -> Composed {
         match self {
             Shader::Extremes => {
-                composed!("common", "entries", "window_pass", "window_herk", "window_kept", "window_extremes")
+                composed!(
+                    "common",
+                    "entries",
+                    "window_pass",
+                    "window_herk",
+                    "window_kept",
+                    "window_tiles",
+                    "window_herk_rows",
+                    "window_extremes"
+                )
             }
-            Shader::Sums32 => composed!("common", "entries", "window_pass", "window_sums", "window_sums32"),
-            Shader::Sums64 => composed!("common", "entries", "window_pass", "window_sums", "window_sums64"),
-            Shader::Obscurance => composed!("common", "obscurance"),
+            Shader::Sums32 => composed!(
+                "common",
+                "entries",
+                "window_pass",
+                "window_sums",
+                "window_tiles",
+                "window_sums_rows",
+                "window_sums32"
+            ),
+            Shader::Sums64 => composed!(
+                "common",
+                "entries",
+                "window_pass",
+                "window_sums",
+                "window_tiles",
+                "window_sums_rows",
+                "window_sums64"
+            ),
+            Shader::Obscurance => composed!("common", "obscurance_narrow", "obscurance"),
+            Shader::ObscuranceWide => composed!("common", "obscurance_wide", "obscurance"),
             Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian"),
             Shader::Gradient => composed!("common", "gradient"),
             Shader::Order => {
-                composed!("common", "entries", "window_pass", "window_herk", "window_kept", "window_order")
+                composed!(
+                    "common",
+                    "entries",
+                    "window_pass",
+                    "window_herk",
+                    "window_kept",
+                    "window_tiles",
+                    "window_herk_rows",
+                    "window_order"
+                )
             }
             Shader::Moments => {
-                composed!("common", "floats", "pairs", "entries", "window_pass", "window_herk", "window_moments")
+                composed!(
+                    "common",
+                    "floats",
+                    "pairs",
+                    "entries",
+                    "window_pass",
+                    "window_herk",
+                    "window_tiles",
+                    "window_herk_rows",
+                    "window_moments"
+                )
             }
             Shader::GaussianVariance => {
                 composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian_variance")
@@ -111,7 +160,7 @@ impl Shader {
 
     pub fn entries(self) -> &'static [&'static str] {
         match self {
-            Shader::Obscurance => &["sweep"],
+            Shader::Obscurance | Shader::ObscuranceWide => &["sweep"],
             Shader::Gradient => &["slopes"],
             Shader::Finish | Shader::Codes => &["finish"],
             Shader::Point => &["point"],
@@ -119,6 +168,9 @@ impl Shader {
             Shader::Masked => &["fill"],
             Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
+            Shader::Extremes | Shader::Sums32 | Shader::Sums64 | Shader::Order | Shader::Moments => {
+                &["first", "next", "rows"]
+            }
             _ => &["first", "next"],
         }
     }
@@ -127,7 +179,7 @@ impl Shader {
     pub fn bindings(self) -> usize {
         match self {
             Shader::Codes | Shader::Point => 5,
-            Shader::Obscurance | Shader::Finish | Shader::LevelPool => 4,
+            Shader::Obscurance | Shader::ObscuranceWide | Shader::Finish | Shader::LevelPool => 4,
             Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
             _ => 2,
         }
@@ -135,7 +187,7 @@ impl Shader {
 
     /// Whether a binding, counted from 1, is written: the second one, and the links of lines.
     pub fn writes(self, binding: usize) -> bool {
-        binding == 2 || (binding == 4 && self == Shader::Obscurance)
+        binding == 2 || (binding == 4 && matches!(self, Shader::Obscurance | Shader::ObscuranceWide))
     }
 }
 

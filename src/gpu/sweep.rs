@@ -31,9 +31,15 @@ pub struct Lines {
     pub packing: u32,
     pub first: u32,
     pub threads: u32,
-    pub fresh: u32,
-    pub spare: [u32; 4],
+    pub links: u32,
+    pub groups: u32,
+    pub spare: [u32; 3],
 }
+
+/// Most families of one dispatch, whose parameters are an array of as many.
+const TOGETHER: usize = 4;
+/// Threads that fill a large GPU (132 x 2048 on an H200): families go side by side up to as many.
+const ENOUGH: usize = 1 << 18;
 
 /// How voxels become codes; `struct Keys` of `shaders/sweep_codes.wgsl`, which explains the fields.
 #[repr(C)]
@@ -79,6 +85,15 @@ impl SweepPart {
     }
 }
 
+/// Lines of a family that are swept at once.
+#[derive(Debug, Clone, Copy)]
+struct Swept {
+    family: usize,
+    planes: usize,
+    first: usize,
+    lines: usize,
+}
+
 impl<'a> SweepJob<'a> {
     /// `None` if codes of this type have more than 32 bits, or a line could have more than 2^16 - 1 planes.
     pub fn new(sweep: &'a Prepared, dtype: DType, src: Region, dst: Region) -> Option<SweepJob<'a>> {
@@ -109,11 +124,38 @@ impl<'a> SweepJob<'a> {
         part.dst.grow(family.halo()).clip(&part.src)
     }
 
+    /// Bytes of what a line leaves at a voxel: a code and steps.
+    fn entry(&self) -> u64 {
+        if self.code == 4 { 8 } else { 4 }
+    }
+
     /// Lines that are swept at once, so that their links stay below `cap` bytes: whole workgroups.
-    fn batch(planes: usize, lines: usize, cap: u64) -> Result<usize, Unfit> {
-        let link = 4 * planes.max(1) as u64;
+    fn batch(&self, planes: usize, lines: usize, cap: u64) -> Result<usize, Unfit> {
+        let link = self.entry() * planes.max(1) as u64;
         let most = (cap / link) as usize / GROUP as usize * GROUP as usize;
         if most > 0 { Ok(lines.min(most)) } else { Err(Unfit::Bytes { needed: link * GROUP as u64, cap }) }
+    }
+
+    /// What each dispatch sweeps, by family: its number, first line and lines. Families go together where they fit.
+    fn dispatches(&self, part: &SweepPart, cap: u64) -> Result<Vec<Vec<Swept>>, Unfit> {
+        let extents: Vec<_> =
+            self.sweep.lines().map(|family| extent(&self.family_box(part, &family), family.axis())).collect();
+        let most = extents.iter().map(|e| e.1).max().unwrap_or(1).max(1);
+        let mut list = Vec::new();
+        let whole = |(family, &(planes, lines)): (usize, &(usize, usize))| Swept { family, planes, first: 0, lines };
+        let all: Vec<Swept> = extents.iter().enumerate().map(whole).collect();
+        for together in all.chunks((ENOUGH / most).clamp(1, TOGETHER)) {
+            if self.entry() * together.iter().map(|s| (s.planes * s.lines) as u64).sum::<u64>() <= cap {
+                list.push(together.to_vec());
+                continue;
+            }
+            for &one in together {
+                let batch = self.batch(one.planes, one.lines, cap)?;
+                let cut = |first| vec![Swept { first, lines: batch.min(one.lines - first), ..one }];
+                list.extend((0..one.lines).step_by(batch).map(cut));
+            }
+        }
+        Ok(list)
     }
 
     /// Largest buffers of any part.
@@ -141,26 +183,38 @@ impl<'a> SweepJob<'a> {
     /// # Errors
     /// Links do not stay below `cap` bytes.
     pub(super) fn sums(&self, part: &SweepPart, codes: Bind, cap: u64, to: &mut Recorder) -> Result<Buffer, Unfit> {
-        let sums = to.take(part.dst.voxels() as u64 * 4);
-        let batches = self.sweep.lines().map(|family| {
-            let (planes, lines) = extent(&self.family_box(part, &family), family.axis());
-            Self::batch(planes, lines, cap).map(|batch| (batch, (planes * batch * 4) as u64))
-        });
-        let batches: Vec<(usize, u64)> = batches.collect::<Result<_, _>>()?;
-        let links = to.take(batches.iter().map(|b| b.1).max().unwrap_or(0));
-        for (number, (family, (batch, _))) in self.sweep.lines().zip(batches).enumerate() {
-            let mut tables = Vec::new();
-            let mut lines = Lines { fresh: (number == 0) as u32, ..self.lines(part, &family, &mut tables) };
-            let start = to.table(tables);
-            lines.shifts += start;
-            lines.tables = lines.tables.map(|t| if t == NOT_SWEPT { t } else { t + start });
-            let all = (lines.size[0] * lines.size[1]) as usize;
-            for first in (0..all).step_by(batch) {
-                let threads = batch.min(all - first) as u32;
-                let lines = Lines { first: first as u32, threads, ..lines };
-                let bind = [codes, sums.into(), Buffer::Tables.into(), links.into()];
-                to.dispatch(Shader::Obscurance, 0, &lines, &bind, threads);
+        let bytes = part.dst.voxels() as u64 * 4;
+        let sums = to.take(bytes);
+        to.clear(sums, bytes);
+        let dispatches = self.dispatches(part, cap)?;
+        let entries = |list: &Vec<Swept>| list.iter().map(|s| s.planes * s.lines).sum::<usize>();
+        let links = to.take(self.entry() * dispatches.iter().map(entries).max().unwrap_or(0) as u64);
+        let described: Vec<Lines> = self
+            .sweep
+            .lines()
+            .map(|family| {
+                let mut tables = Vec::new();
+                let mut lines = self.lines(part, &family, &mut tables);
+                let start = to.table(tables);
+                lines.shifts += start;
+                lines.tables = lines.tables.map(|t| if t == NOT_SWEPT { t } else { t + start });
+                lines
+            })
+            .collect();
+        for list in dispatches {
+            let widest = list.iter().map(|s| s.lines as u32).max().unwrap_or(0);
+            let groups = widest.div_ceil(GROUP);
+            // A family that is not there has no threads.
+            let mut families = [Lines { groups, ..Lines::default() }; TOGETHER];
+            let mut entry = 0;
+            for (to, swept) in families.iter_mut().zip(&list) {
+                let (first, threads) = (swept.first as u32, swept.lines as u32);
+                *to = Lines { first, threads, links: entry, groups, ..described[swept.family] };
+                entry += (swept.planes * swept.lines) as u32;
             }
+            let bind = [codes, sums.into(), Buffer::Tables.into(), links.into()];
+            let shader = if self.code == 4 { Shader::ObscuranceWide } else { Shader::Obscurance };
+            to.dispatch(shader, 0, &families, &bind, groups * GROUP * list.len() as u32);
         }
         to.give(links);
         Ok(sums)
@@ -176,7 +230,9 @@ impl<'a> SweepJob<'a> {
         let first = bounds.lo[order[0]];
         for &axis in &order[1..] {
             let start = family.displacement(axis, first);
-            tables.extend((first..first + planes as i64).map(|k| (family.displacement(axis, k) - start) as i32 as u32));
+            let along = (first..first + planes as i64).map(|k| family.displacement(axis, k));
+            let before = std::iter::once(start).chain(along.clone());
+            tables.extend(along.zip(before).map(|(here, before)| (here - before) as i32 as u32));
         }
         let starts = [0, 1].map(|way| match family.table(way) {
             None => NOT_SWEPT,
@@ -231,6 +287,7 @@ fn extent(bounds: &Region, axis: usize) -> (usize, usize) {
 
 #[cfg(test)]
 mod tests {
+    use super::super::record::Command;
     use super::*;
     use crate::kernel::obscurance::ObscuranceParams;
     use crate::stage::{DirectionSet, DirectionWeights, Rho};
@@ -269,7 +326,8 @@ mod tests {
                 let mut at = [line / p.size[1], line % p.size[1]].map(|v| v as i32);
                 for i in 0..p.planes {
                     for (k, (at, size)) in at.iter_mut().zip(p.size).enumerate() {
-                        let by = if i > 0 { shift(k, i) - shift(k, i - 1) } else { 0 };
+                        let by = shift(k, i);
+                        assert!(i > 0 || by == 0);
                         assert!(by.abs() <= 1);
                         *at = (*at + by).rem_euclid(size as i32);
                     }
@@ -294,7 +352,27 @@ mod tests {
                     let recording = job.record(part, cap);
                     assert_eq!(recording.fault(), None);
                     assert!(recording.sizes.largest() <= cap && part.src.contains(&part.dst));
-                    assert!(recording.dispatches().count() >= sweep.lines().len());
+                    let voxels = part.dst.voxels() as u64;
+                    assert_eq!(
+                        recording
+                            .commands
+                            .iter()
+                            .filter(|c| matches!(c, Command::Clear(_, b) if *b == 4 * voxels))
+                            .count(),
+                        1
+                    );
+                    assert!(recording.dispatches().count() >= sweep.lines().len().div_ceil(TOGETHER));
+                    for d in recording.dispatches() {
+                        let families: &[Lines] = bytemuck::cast_slice(&d.params);
+                        let swept: Vec<_> = families.iter().filter(|f| f.threads > 0).collect();
+                        assert_eq!(d.threads, swept.len() as u32 * swept[0].groups * GROUP);
+                        // Links side by side, in whole.
+                        let mut links = 0;
+                        for f in swept {
+                            assert!(f.links == links && f.threads <= f.groups * GROUP);
+                            links += f.planes * f.threads;
+                        }
+                    }
                 }
             }
         }

@@ -28,7 +28,8 @@ pub struct Taps {
     pub threads: u32,
     pub centres: u32,
     pub last: u32,
-    pub spare: [u32; 3],
+    pub strip: u32,
+    pub spare: [u32; 2],
 }
 
 /// One call, all extents `[z, y, x]`.
@@ -54,6 +55,8 @@ pub struct Wanted {
 
 /// A moment and the shader that makes it.
 const MEAN: Shader = Shader::Gaussian;
+/// Outputs of a thread of the mean; the shader's vectors.
+const STRIP: usize = 4;
 const VARIANCE: Shader = Shader::GaussianVariance;
 
 impl TapsJob {
@@ -138,9 +141,11 @@ impl TapsJob {
             let (sigma, radius, n) = (self.sigma[axis], self.radius[axis], self.src[axis]);
             let centres = (0..part.dst[axis]).map(|k| self.at[axis] + part.lo[axis] + k);
             let weights = tables.len() as u32;
-            for p in centres.clone() {
-                tables.extend(gaussian::shared::weights(sigma, radius, p, n).map(f32::to_bits));
-            }
+            let of_outputs: Vec<Vec<u32>> = centres
+                .clone()
+                .map(|p| gaussian::shared::weights(sigma, radius, p, n).map(f32::to_bits).collect())
+                .collect();
+            tables.extend((0..radius).flat_map(|d| of_outputs.iter().map(move |w| w[d])));
             let start = tables.len() as u32;
             tables.extend(centres.map(|p| gaussian::shared::centre_weight(sigma, radius, p, n).to_bits()));
             [weights, start]
@@ -166,6 +171,9 @@ impl TapsJob {
         let mut extent = part.src;
         for (entry, axis) in [(0, 2), (1, 1), (1, 0)] {
             extent[axis] = part.dst[axis];
+            let strip = if shader == MEAN { STRIP } else { 1 };
+            let mut threads = extent;
+            threads[axis] = extent[axis].div_ceil(strip);
             let next = [extent[1] * extent[2], extent[2], 1];
             let others = [[1, 2], [0, 2], [0, 1]][axis];
             let order = |s: [usize; 3]| [s[axis] as u32, s[others[0]] as u32, s[others[1]] as u32];
@@ -177,15 +185,16 @@ impl TapsJob {
                 radius: self.radius[axis] as u32,
                 input: order(strides),
                 output: order(next),
-                inner: extent[2] as u32,
-                middle: extent[1] as u32,
+                inner: threads[2] as u32,
+                middle: threads[1] as u32,
                 axis: axis as u32,
                 weights: starts[axis][0],
                 packing: if self.voxel == 1 { 2 } else { 1 },
                 sign: if self.signed { 1 << (8 * self.voxel - 1) } else { 0 },
-                threads: extent.iter().product::<usize>() as u32,
+                threads: threads.iter().product::<usize>() as u32,
                 centres: starts[axis][1],
                 last: (axis == 0) as u32,
+                strip: strip as u32,
                 ..Taps::default()
             };
             let input = [Bind::from(b), a.into(), from][axis];

@@ -1,0 +1,17 @@
+// Entries of codes of 8 or 16 bits: the code in the high half, the steps in the low one.
+
+alias Entry = u32;
+
+const RING: u32 = 32u;
+
+fn entry_of(code: u32, step: u32) -> Entry {
+    return (code << 16u) | step;
+}
+
+fn code_of(entry: Entry) -> u32 {
+    return entry >> 16u;
+}
+
+fn step_of(entry: Entry) -> u32 {
+    return entry & 0xffffu;
+}

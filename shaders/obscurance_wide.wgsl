@@ -1,0 +1,17 @@
+// Entries of codes of up to 32 bits: the code, the steps.
+
+alias Entry = vec2<u32>;
+
+const RING: u32 = 32u;
+
+fn entry_of(code: u32, step: u32) -> Entry {
+    return Entry(code, step);
+}
+
+fn code_of(entry: Entry) -> u32 {
+    return entry.x;
+}
+
+fn step_of(entry: Entry) -> u32 {
+    return entry.y;
+}
