@@ -72,7 +72,8 @@ def rows_of_cupy(cupy, filters):
         out = cupy.empty_like(v)
         for radius in [10, 40]:
             for name in ["uniform_filter", "minimum_filter", "maximum_filter"]:
-                for mode in ["nearest", "reflect"]:
+                # Its default, once: it takes twice as long.
+                for mode in ["nearest", "reflect"] if (dtype, radius) == ("uint8", 10) else ["nearest"]:
                     f = getattr(filters, name)
                     ms = timed(cupy, lambda: f(v, 2 * radius + 1, output=out, mode=mode))
                     same = agrees(cupy, filters, name, radius, mode, dtype)

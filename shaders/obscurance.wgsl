@@ -37,7 +37,7 @@ struct Lines {
     at_a: i32,       // first output voxel, in the box
     at_b: i32,
     at_c: i32,
-    shifts: u32,     // displacement along b by plane, less the first plane's; then along c
+    shifts: u32,     // displacements by plane from the one before, along b in the low half of a word, along c in the high one
     forward: u32,    // contributions toward growing planes, `reach` + 1 of them, the last where nothing occludes
     backward: u32,   // toward falling planes; 0xffffffff: a sense that is not swept
     packing: u32,    // log2 of codes per word
@@ -57,6 +57,8 @@ struct Lines {
 @group(0) @binding(4) var<storage, read_write> links: array<Entry>;
 
 const NOT_SWEPT: u32 = 0xffffffffu;
+// Steps of a voxel without a greater code ahead: more than there are planes.
+const NONE: u32 = 0xffffu;
 
 var<private> p: Lines;
 // Of each thread the entries of the planes that it was at last, by their number modulo `RING`.
@@ -69,7 +71,8 @@ fn code(plane: u32, at: vec2<i32>) -> u32 {
 
 // The way from the plane before to this one.
 fn shift(plane: u32) -> vec2<i32> {
-    return vec2<i32>(bitcast<i32>(tables[p.shifts + plane]), bitcast<i32>(tables[p.shifts + p.planes + plane]));
+    let both = bitcast<i32>(tables[p.shifts + plane]);
+    return vec2<i32>((both << 16u) >> 16u, both >> 16u);
 }
 
 // The place at another plane; z is 1 where the way there leaves the box at a side and comes back at the other.
@@ -91,9 +94,10 @@ fn leave(plane: u32, thread: u32, local: u32, entry: Entry) {
     ring[(plane % RING) * 64u + local] = entry;
 }
 
-// Steps from `plane` to the first greater code than `own`, no more than `room` planes away; 0 if there is none.
+// Steps from `plane` to the first greater code than `own`, no more than `room` planes away; `NONE` if there is none.
 fn seek(plane: u32, own: u32, room: u32, thread: u32, local: u32, way: i32) -> u32 {
     var d = 1u;
+    let below = entry_of(own, 0xffffu);
     while d <= room {
         let other = u32(i32(plane) + way * i32(d));
         var entry: Entry;
@@ -102,20 +106,17 @@ fn seek(plane: u32, own: u32, room: u32, thread: u32, local: u32, way: i32) -> u
         } else {
             entry = links[place_of(other, thread)];
         }
-        if code_of(entry) > own {
+        if is_beyond(entry, below) {
             return d;
         }
-        let step = step_of(entry);
-        if step == 0u {
-            return 0u;
-        }
-        d += step;
+        // Without a greater one: beyond all room.
+        d += step_of(entry);
     }
-    return 0u;
+    return NONE;
 }
 
 fn contribution(table: u32, d: u32) -> u32 {
-    return tables[table + select(d - 1u, p.reach, d == 0u)];
+    return tables[table + min(d - 1u, p.reach)];
 }
 
 fn add_up(plane: u32, at: vec2<i32>, sum: u32) {
@@ -138,7 +139,7 @@ fn go(start: vec2<i32>, thread: u32, local: u32) -> vec2<i32> {
             next = move_by(at, shift(i + 1u));
             ahead = code(i + 1u, next.xy);
         }
-        var d = 0u;
+        var d = NONE;
         if p.backward != NOT_SWEPT {
             d = seek(i, own, min(room, p.reach), thread, local, -1);
         }

@@ -15,3 +15,8 @@ fn code_of(entry: Entry) -> u32 {
 fn step_of(entry: Entry) -> u32 {
     return entry.y;
 }
+
+// Whether the code of `entry` is greater than that of `below`.
+fn is_beyond(entry: Entry, below: Entry) -> bool {
+    return entry.x > below.x;
+}

@@ -41,6 +41,9 @@ struct Codes {
     channels: array<vec4<u32>, 4>, // what each is, and 256 where constant windows are half open
 }
 
+// What is compiled: 1 results in f64, 2 numerators of variances, 4 openness by powers, 8 by spreads.
+override parts: u32 = 15u;
+
 // Divisions that find a thread's place cost as much as a voxel.
 const STRIP: u32 = 4u;
 
@@ -209,7 +212,7 @@ fn single_of(a: vec2<u32>, b: vec2<u32>) -> f32 {
 fn openness(w: Window, kind: u32, half: bool) -> f32 {
     let constant = select(1.0, 0.5, half);
     let turned = p.flipped == 1u;
-    if kind == 6u {
+    if (parts & 4u) != 0u && kind == 6u {
         if w.lo == w.hi {
             return constant;
         }
@@ -222,7 +225,7 @@ fn openness(w: Window, kind: u32, half: bool) -> f32 {
         }
         return power(below, above, f32(w.hi - w.lo), over, under);
     }
-    if is_zero64(w.numerator) {
+    if (parts & 8u) == 0u || is_zero64(w.numerator) {
         return constant;
     }
     let away = single(of_difference(times32(w.n, w.v), w.s1));
@@ -230,7 +233,7 @@ fn openness(w: Window, kind: u32, half: bool) -> f32 {
 }
 
 fn extreme(code: u32) -> u32 {
-    if p.scaled == 0u {
+    if (parts & 1u) == 0u || p.scaled == 0u {
         return bitcast<u32>(f32(i32(code) - i32(p.flip)));
     }
     return narrowed(scaled(of_difference(vec2<u32>(code, 0u), vec2<u32>(p.flip, 0u))));
@@ -244,7 +247,7 @@ fn result(w: Window, channel: u32) -> u32 {
     let negative = p.scaled == 1u && (p.slope.y & SIGN) != 0u;
     switch channel & 255u {
         case 0u: {
-            if is_plain(w) {
+            if (parts & 1u) == 0u || is_plain(w) {
                 return plain_mean(w);
             }
             return narrowed(w.mean);
@@ -253,9 +256,15 @@ fn result(w: Window, channel: u32) -> u32 {
             return extreme(select(w.lo, w.hi, negative != (channel == 2u)));
         }
         case 3u: {
+            if (parts & 1u) == 0u {
+                return 0u;
+            }
             return narrowed(spread(w.variance));
         }
         case 4u: {
+            if (parts & 1u) == 0u {
+                return 0u;
+            }
             let root = root_of(w.variance);
             if p.scaled == 0u {
                 return narrowed(root);
@@ -263,9 +272,15 @@ fn result(w: Window, channel: u32) -> u32 {
             return narrowed(product_of(vec2<u32>(p.slope.x, p.slope.y & ~SIGN), root));
         }
         case 5u: {
+            if (parts & 1u) == 0u {
+                return 0u;
+            }
             return narrowed(sum_of(spread(w.variance), product_of(w.mean, w.mean)));
         }
         default: {
+            if (parts & 12u) == 0u {
+                return 0u;
+            }
             return bitcast<u32>(openness(w, channel & 255u, channel >= 256u));
         }
     }
@@ -303,17 +318,17 @@ fn finish_at(z: u32, y: u32, x: u32) {
             w.s1 = vec2<u32>(sums[2u * voxel], sums[2u * voxel + 1u]);
         }
     }
-    if (p.needs & 2u) != 0u {
+    if (parts & 2u) != 0u && (p.needs & 2u) != 0u {
         w.s2 = vec2<u32>(squares[voxel], 0u);
         if (p.wide & 2u) != 0u {
             w.s2 = vec2<u32>(squares[2u * voxel], squares[2u * voxel + 1u]);
         }
         w.numerator = numerator(w);
     }
-    if (p.needs & 8u) != 0u {
+    if (parts & 1u) != 0u && (p.needs & 8u) != 0u {
         w.mean = mean(w);
     }
-    if (p.needs & 16u) != 0u {
+    if (parts & 1u) != 0u && (p.needs & 16u) != 0u {
         w.variance = variance(w);
     }
     for (var c = 0u; c < p.count; c += 1u) {

@@ -4,7 +4,7 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: packed codes (`first`) or pairs (`next`); 2 storage, read and
 // written: pairs. Workgroup: window_pass.wgsl.
 
-const COLUMNS: u32 = 32u;
+const COLUMNS: u32 = 16u;
 
 alias Seen = u32;
 

@@ -11,6 +11,33 @@ fn seen_of(row: u32, q: i32) -> Seen {
     return nothing();
 }
 
+// Entries k, k + 64, ... of a tile whose column 0 is voxel q.
+fn seen_of_batch(first: u32, k: u32, q: i32) -> array<Seen, BATCH> {
+    return array<Seen, BATCH>(
+        seen_of(first + row_of(k), q + i32(column_of(k))),
+        seen_of(first + row_of(k + 64u), q + i32(column_of(k + 64u))),
+        seen_of(first + row_of(k + 128u), q + i32(column_of(k + 128u))),
+        seen_of(first + row_of(k + 192u), q + i32(column_of(k + 192u))),
+    );
+}
+
+// What was kept at output o of a row; nothing where it does not exist or lies beyond `high`.
+fn kept_of(row: u32, o: i32, high: i32) -> Seen {
+    if row < p.lines && o >= 0 && o < high {
+        return kept(row * p.out_i + u32(o));
+    }
+    return nothing();
+}
+
+fn kept_of_batch(first: u32, k: u32, o: i32, high: i32) -> array<Seen, BATCH> {
+    return array<Seen, BATCH>(
+        kept_of(first + row_of(k), o + i32(column_of(k)), high),
+        kept_of(first + row_of(k + 64u), o + i32(column_of(k + 64u)), high),
+        kept_of(first + row_of(k + 128u), o + i32(column_of(k + 128u)), high),
+        kept_of(first + row_of(k + 192u), o + i32(column_of(k + 192u)), high),
+    );
+}
+
 // What `made` holds of 64 rows from output `o` on, to those from `low` on and before `high`.
 fn keep_tile(first: u32, o: i32, low: i32, high: i32, local: u32) {
     for (var k = local; k < 64u * COLUMNS; k += 64u) {
@@ -35,8 +62,8 @@ fn walk_rows(first: u32, span: i32, local: u32) {
     for (var high = top; high > bottom; high -= step) {
         let low = high - step;
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u) {
-            made[slot_of(row_of(k), column_of(k))] = seen_of(first + row_of(k), low + i32(column_of(k)));
+        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
+            bring_made(k, seen_of_batch(first, k, low));
         }
         workgroupBarrier();
         var place = (high - 1 - start) % w;
@@ -58,15 +85,11 @@ fn walk_rows(first: u32, span: i32, local: u32) {
     let last = min(stop, m);
     for (var o = start; o < last; o += step) {
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u) {
-            let row = first + row_of(k);
-            let to = o + i32(column_of(k));
-            ahead[slot_of(row_of(k), column_of(k))] = seen_of(row, to + w - 1);
-            var before = nothing();
-            if row < p.lines && to >= 0 && to < last {
-                before = kept(row * p.out_i + u32(to));
-            }
-            made[slot_of(row_of(k), column_of(k))] = before;
+        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
+            let come = seen_of_batch(first, k, o + w - 1);
+            let before = kept_of_batch(first, k, o, last);
+            bring_ahead(k, come);
+            bring_made(k, before);
         }
         workgroupBarrier();
         var place = (o - start) % w;

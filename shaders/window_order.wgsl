@@ -5,7 +5,7 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: bits of f32 (`first`) or words of pairs (`next`); 2 storage, read and
 // written: pairs, least and greatest. Workgroup: window_pass.wgsl.
 
-const COLUMNS: u32 = 16u;
+const COLUMNS: u32 = 8u;
 
 alias Seen = vec2<u32>;
 

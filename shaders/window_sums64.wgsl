@@ -4,7 +4,7 @@
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: packed codes (`first`) or words of pairs of sums (`next`); 2 storage,
 // written: pairs. Workgroup: window_pass.wgsl.
 
-const COLUMNS: u32 = 16u;
+const COLUMNS: u32 = 8u;
 
 alias Sum = vec2<u32>;
 

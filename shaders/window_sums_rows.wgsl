@@ -10,6 +10,16 @@ fn seen_of(row: u32, q: i32, low: i32, high: i32) -> Sum {
     return select(Sum(), term(place, false), there);
 }
 
+// Entries k, k + 64, ... of a tile whose column 0 is voxel q.
+fn seen_of_batch(first: u32, k: u32, q: i32, low: i32, high: i32) -> array<Sum, BATCH> {
+    return array<Sum, BATCH>(
+        seen_of(first + row_of(k), q + i32(column_of(k)), low, high),
+        seen_of(first + row_of(k + 64u), q + i32(column_of(k + 64u)), low, high),
+        seen_of(first + row_of(k + 128u), q + i32(column_of(k + 128u)), low, high),
+        seen_of(first + row_of(k + 192u), q + i32(column_of(k + 192u)), low, high),
+    );
+}
+
 fn walk_rows(first: u32, span: i32, local: u32) {
     let w = i32(p.window);
     let start = span * i32(p.block);
@@ -19,8 +29,8 @@ fn walk_rows(first: u32, span: i32, local: u32) {
     // The first window but its last voxel.
     for (var q = start; q < start + w - 1; q += step) {
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u) {
-            ahead[slot_of(row_of(k), column_of(k))] = seen_of(first + row_of(k), q + i32(column_of(k)), start, start + w - 1);
+        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
+            bring_ahead(k, seen_of_batch(first, k, q, start, start + w - 1));
         }
         workgroupBarrier();
         for (var c = 0u; c < COLUMNS; c += 1u) {
@@ -29,11 +39,11 @@ fn walk_rows(first: u32, span: i32, local: u32) {
     }
     for (var o = start; o < end; o += step) {
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u) {
-            let row = first + row_of(k);
-            let q = o + i32(column_of(k));
-            ahead[slot_of(row_of(k), column_of(k))] = seen_of(row, q + w - 1, start, end + w);
-            made[slot_of(row_of(k), column_of(k))] = seen_of(row, q - 1, start, end);
+        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
+            let come = seen_of_batch(first, k, o + w - 1, start, end + w);
+            let gone = seen_of_batch(first, k, o - 1, start, end);
+            bring_ahead(k, come);
+            bring_made(k, gone);
         }
         workgroupBarrier();
         for (var c = 0u; c < COLUMNS; c += 1u) {

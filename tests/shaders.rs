@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use naga::Module;
+use naga::back::pipeline_constants::process_overrides;
 use naga::back::{hlsl, msl, spv};
 use naga::front::wgsl;
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
@@ -24,15 +25,18 @@ fn check(text: &str) -> Result<Vec<String>, String> {
 /// A shader in the languages of Vulkan (as words), Metal and Direct3D 12.
 fn translated(text: &str) -> Result<(Vec<u32>, String, String), String> {
     let (module, info) = parsed(text)?;
-    let spv = spv::write_vec(&module, &info, &spv::Options::default(), None).map_err(|e| format!("SPIR-V: {e}"))?;
+    let constants = Default::default();
+    let settled = process_overrides(&module, &info, None, &constants).map_err(|e| format!("constants: {e}"))?;
+    let (module, info) = (settled.0.as_ref(), settled.1.as_ref());
+    let spv = spv::write_vec(module, info, &spv::Options::default(), None).map_err(|e| format!("SPIR-V: {e}"))?;
     let (options, of_pipeline) = (msl::Options::default(), msl::PipelineOptions::default());
     let (metal, entries) =
-        msl::write_string(&module, &info, &options, &of_pipeline).map_err(|e| format!("MSL: {e}"))?;
+        msl::write_string(module, info, &options, &of_pipeline).map_err(|e| format!("MSL: {e}"))?;
     entries.entry_point_names.into_iter().collect::<Result<Vec<_>, _>>().map_err(|e| format!("MSL: {e}"))?;
     let mut direct = String::new();
     let (options, of_pipeline) = (hlsl::Options::default(), hlsl::PipelineOptions::default());
     let mut writer = hlsl::Writer::new(&mut direct, &options, &of_pipeline);
-    let entries = writer.write(&module, &info, None).map_err(|e| format!("HLSL: {e}"))?;
+    let entries = writer.write(module, info, None).map_err(|e| format!("HLSL: {e}"))?;
     entries.entry_point_names.into_iter().collect::<Result<Vec<_>, _>>().map_err(|e| format!("HLSL: {e}"))?;
     Ok((spv, metal, direct))
 }

@@ -1,6 +1,7 @@
 //! Finds an adapter and opens it: by the system's own way only, ranked by device type, software refused unless asked for by name.
 
-use std::sync::{Arc, Condvar, Mutex, OnceLock};
+use std::collections::HashMap;
+use std::sync::{Arc, Condvar, Mutex};
 
 use super::backend;
 use super::facts::{GpuFacts, GpuKind, SLOTS};
@@ -11,14 +12,22 @@ use super::slot::Slot;
 pub struct Device {
     pub device: wgpu::Device,
     pub queue: wgpu::Queue,
-    /// By shader, in the order of [`Shader::ALL`], and entry point; made when they are first used.
-    kernels: Vec<[OnceLock<Kernel>; 3]>,
+    /// Made when they are first used.
+    kernels: Mutex<HashMap<Kind, Arc<Kernel>>>,
     /// Nanoseconds of a tick of the time stamps, where they were asked for and there are any.
     pub tick: Option<f64>,
     slots: Mutex<Vec<Slot>>,
     idle: Condvar,
     /// What the driver reported outside of any call's error scopes, and the loss of the device.
     pub fault: Arc<Mutex<Option<String>>>,
+}
+
+/// What is compiled: an entry point of a shader, of which only some parts are asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Kind {
+    pub shader: Shader,
+    pub entry: usize,
+    pub parts: u32,
 }
 
 /// An entry point's layout of bindings and pipeline.
@@ -104,13 +113,14 @@ pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
         close_floats: false,
     };
     let tick = timed.then(|| queue.get_timestamp_period() as f64);
-    let kernels = Shader::ALL.iter().map(|_| Default::default()).collect();
+    let kernels = Mutex::new(HashMap::new());
     let slots = (0..SLOTS).map(|_| Slot::default()).collect();
     let (slots, idle) = (Mutex::new(slots), Condvar::new());
     Ok((Device { device, queue, kernels, tick, slots, idle, fault }, facts))
 }
 
-fn kernel(device: &wgpu::Device, shader: Shader, entry_point: usize) -> Kernel {
+fn kernel(device: &wgpu::Device, kind: Kind) -> Kernel {
+    let shader = kind.shader;
     let name = shader.name();
     let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
         binding,
@@ -130,23 +140,21 @@ fn kernel(device: &wgpu::Device, shader: Shader, entry_point: usize) -> Kernel {
     });
     let source = wgpu::ShaderSource::Wgsl(shader.text().into());
     let module = wgpu::ShaderModuleDescriptor { label: Some(name), source };
-    // What indices reach beyond a buffer stays checked.
-    // SAFETY: every loop of the shaders counts up or down to a bound that does not change in it (`seek` steps by at least one),
+    // SAFETY: indices come from extents and strides that the recorders make with the sizes of the buffers (a driver that can
+    // checks them all the same); every loop of the shaders counts up or down to a bound that does not change in it (`seek` steps by at least one),
     // so none is endless; every divisor is a constant or an extent or count of the parameters, which `Recording::fault` and
     // the recorders keep above 0; there are no rays and no meshes.
-    let module = unsafe {
-        let checks = wgpu::ShaderRuntimeChecks { bounds_checks: true, ..wgpu::ShaderRuntimeChecks::all(false) };
-        device.create_shader_module_trusted(module, checks)
-    };
+    let module = unsafe { device.create_shader_module_trusted(module, wgpu::ShaderRuntimeChecks::unchecked()) };
+    let parts = [("parts", kind.parts as f64)];
     let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(name),
         layout: Some(&shared),
         module: &module,
-        entry_point: Some(shader.entries()[entry_point]),
+        entry_point: Some(shader.entries()[kind.entry]),
         // Nothing in workgroup memory is read before it is written.
         compilation_options: wgpu::PipelineCompilationOptions {
             zero_initialize_workgroup_memory: false,
-            ..Default::default()
+            constants: if shader.has_parts() { &parts } else { &[] },
         },
         cache: None,
     });
@@ -155,9 +163,9 @@ fn kernel(device: &wgpu::Device, shader: Shader, entry_point: usize) -> Kernel {
 
 impl Device {
     /// The pipeline of an entry point. What the driver says against it comes through the device's error scopes.
-    pub fn kernel(&self, shader: Shader, entry: usize) -> &Kernel {
-        let place = Shader::ALL.iter().position(|s| *s == shader).expect("ALL holds every shader");
-        self.kernels[place][entry].get_or_init(|| kernel(&self.device, shader, entry))
+    pub fn kernel(&self, kind: Kind) -> Arc<Kernel> {
+        let mut kernels = self.kernels.lock().unwrap_or_else(|e| e.into_inner());
+        kernels.entry(kind).or_insert_with(|| Arc::new(kernel(&self.device, kind))).clone()
     }
 
     /// Whether a call would have to wait for a slot.

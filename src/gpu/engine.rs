@@ -6,10 +6,9 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 use super::backend;
-use super::device::{self, Device, SlotGuard};
+use super::device::{self, Device, Kind, SlotGuard};
 use super::facts::{GpuFacts, GpuKind};
 use super::record::{Command, Dispatch, PARAMS_STRIDE, Recording, STAMP_BYTES, STAMPS, groups};
-use super::recorder::Recorder;
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
 /// stays silent for longer is taken for lost.
@@ -124,29 +123,6 @@ impl Gpu {
     /// Holds each buffer to `bytes` (at most what the adapter allows); larger calls are cut into parts.
     pub fn set_cap(&mut self, bytes: u64) {
         self.cap = bytes.min(self.facts.most_bytes);
-    }
-
-    /// Bytes per second that a copy on the device reads and writes, both counted: what passes over memory are measured by.
-    /// `None` without time stamps ([`Gpu::open_timed`]).
-    ///
-    /// # Errors
-    /// A failure of the device.
-    pub fn copy_rate(&self) -> Result<Option<f64>, GpuError> {
-        /// Larger than caches.
-        const BYTES: u64 = 256 << 20;
-        let bytes = BYTES.min(self.cap);
-        let mut recorder = Recorder::new(4);
-        let [a, b] = [(); 2].map(|()| recorder.take(bytes));
-        let back = recorder.read(b.into(), 4);
-        debug_assert_eq!(back, 0);
-        let mut recording = recorder.finish().map_err(|e| GpuError(format!("{e:?}")))?;
-        let copies = [(a, b), (b, a), (a, b), (b, a)].map(|(from, to)| Command::Copy { from, to, bytes });
-        recording.commands.splice(0..0, copies);
-        self.attempt(|device| {
-            let mut times = Times::default();
-            run_part(device, &recording, &mut |_| true, &mut |_| Ok(()), &mut times)?;
-            Ok(device.tick.map(|_| 8.0 * bytes as f64 / times.stamps[2]))
-        })
     }
 
     pub(super) fn cap(&self) -> u64 {
@@ -389,9 +365,6 @@ fn encode(
             Command::Readback(r) => {
                 encoder.copy_buffer_to_buffer(slot.of(r.from.buffer), r.from.from, slot.read.get(), r.to, r.bytes);
             }
-            Command::Copy { from, to, bytes } => {
-                encoder.copy_buffer_to_buffer(slot.of(*from), 0, slot.of(*to), 0, *bytes);
-            }
             Command::Clear(buffer, bytes) => encoder.clear_buffer(slot.of(*buffer), 0, Some(*bytes)),
             Command::Dispatch(_) => {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
@@ -406,7 +379,7 @@ fn encode(
 }
 
 fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, pass: &mut wgpu::ComputePass) {
-    let kernel = device.kernel(d.shader, d.entry);
+    let kernel = device.kernel(Kind { shader: d.shader, entry: d.entry, parts: d.parts });
     let size = wgpu::BufferSize::new(d.params.len() as u64);
     let params = wgpu::BufferBinding { buffer: held.slot.params.get(), offset, size };
     let mut entries = vec![wgpu::BindGroupEntry { binding: 0, resource: wgpu::BindingResource::Buffer(params) }];

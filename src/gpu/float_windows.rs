@@ -30,7 +30,10 @@ pub(super) fn finish(
     if job.finish.is_some() {
         let results: &[u32] = cast(bytes)?;
         store_all(results, part, outs);
-        redo(job, part, |i| results[i] == MARKED, src, params, outs, cx);
+        // A plane shows it: all channels of a voxel are marked.
+        if results[..part.dst.iter().product::<usize>()].contains(&MARKED) {
+            redo(job, part, |i| results[i] == MARKED, src, params, outs, cx);
+        }
         return Ok(());
     }
     let moments = FloatPart::new(job, part, bytes)?;

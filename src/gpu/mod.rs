@@ -18,6 +18,7 @@
 //! | `backend` | Vulkan, Metal or Direct3D 12 |
 //! | `device`, `slot` | an open adapter, the buffers of one brick on its way |
 //! | `engine` | runs recordings, survives a lost device once |
+//! | `rate` | how fast a device moves memory |
 //! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
 //!
 //! Everything above `backend` knows no wgpu.
@@ -44,6 +45,7 @@ pub mod pairs;
 pub mod passes;
 pub mod points;
 mod probe;
+mod rate;
 pub mod record;
 pub mod recorder;
 pub mod shaders;

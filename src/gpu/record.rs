@@ -45,6 +45,8 @@ pub struct Dispatch {
     pub shader: Shader,
     /// Index into [`Shader::entries`].
     pub entry: usize,
+    /// What of a shader with [`Shader::has_parts`] is compiled; else 0.
+    pub parts: u32,
     /// The shader's uniform struct.
     pub params: Vec<u8>,
     /// [`Shader::bindings`] of them.
@@ -66,12 +68,6 @@ pub enum Command {
     Dispatch(Dispatch),
     /// Zeros in so many first bytes of a buffer.
     Clear(Buffer, u64),
-    /// From the start of one buffer to the start of another.
-    Copy {
-        from: Buffer,
-        to: Buffer,
-        bytes: u64,
-    },
     Readback(Readback),
 }
 
@@ -108,10 +104,6 @@ impl Recording {
             Command::Clear(b, bytes) => {
                 let wrong = self.sizes.of(*b) < *bytes || bytes % 4 != 0;
                 wrong.then(|| format!("{bytes} bytes of {b:?} are cleared"))
-            }
-            Command::Copy { from, to, bytes } => {
-                let wrong = from == to || [from, to].iter().any(|b| *bytes > self.sizes.of(**b));
-                wrong.then(|| format!("a copy of {bytes} bytes from {from:?} to {to:?}"))
             }
             Command::Readback(r) => {
                 let wrong = r.from.from + r.bytes > self.sizes.of(r.from.buffer)
@@ -221,7 +213,7 @@ mod tests {
         let dispatch = |bind: &[Buffer]| {
             let (shader, params) = (Shader::Sums32, vec![0; 80]);
             let bind = bind.iter().map(|b| Bind::from(*b)).collect();
-            Command::Dispatch(Dispatch { shader, entry: 0, params, bind, threads: 1 })
+            Command::Dispatch(Dispatch { shader, entry: 0, parts: 0, params, bind, threads: 1 })
         };
         let back = |from, bytes| Command::Readback(Readback { from: Bind { buffer: a, from }, bytes, to: 0 });
         let of = |commands: Vec<Command>| Recording { sizes, tables: vec![], commands }.fault();
@@ -235,9 +227,6 @@ mod tests {
         assert!(of(vec![dispatch(&[Buffer::Source, Buffer::Work(1)])]).is_some(), "a buffer of no bytes");
         assert!(of(vec![back(0, 516)]).is_some() && of(vec![back(256, 260)]).is_some());
         assert!(of(vec![Command::Clear(Buffer::Work(1), 4)]).is_some());
-        let copy = |from, to, bytes| of(vec![Command::Copy { from, to, bytes }]);
-        assert_eq!(copy(Buffer::Source, a, 256), None);
-        assert!(copy(a, a, 256).is_some() && copy(Buffer::Source, a, 512).is_some());
         assert!(of(vec![dispatch(&[Buffer::Source, a]); 2]).is_some(), "parameters of two");
     }
 }

@@ -57,8 +57,15 @@ impl Recorder {
         threads: u32,
     ) {
         let params = bytemuck::bytes_of(params).to_vec();
-        let dispatch = Dispatch { shader, entry, params, bind: bind.to_vec(), threads };
+        let dispatch = Dispatch { shader, entry, parts: 0, params, bind: bind.to_vec(), threads };
         self.recording.commands.push(Command::Dispatch(dispatch));
+    }
+
+    /// Of the shader that was dispatched last only these parts are compiled.
+    pub fn only(&mut self, parts: u32) {
+        if let Some(Command::Dispatch(d)) = self.recording.commands.last_mut() {
+            d.parts = parts;
+        }
     }
 
     /// Zeros in so many first bytes of a buffer, a whole number of words.

@@ -17,7 +17,7 @@ macro_rules! composed {
 }
 
 /// The shaders, each with its text and entry points.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Shader {
     Extremes,
     Sums32,
@@ -41,10 +41,11 @@ pub enum Shader {
     Masked,
     Extend,
     SweepCodes,
+    Copy,
 }
 
 impl Shader {
-    pub const ALL: [Shader; 20] = [
+    pub const ALL: [Shader; 21] = [
         Shader::Extremes,
         Shader::Sums32,
         Shader::Sums64,
@@ -65,6 +66,7 @@ impl Shader {
         Shader::Masked,
         Shader::Extend,
         Shader::SweepCodes,
+        Shader::Copy,
     ];
 
     fn composed(self) -> Composed {
@@ -141,6 +143,7 @@ impl Shader {
             Shader::Masked => composed!("common", "masked"),
             Shader::Extend => composed!("common", "extend"),
             Shader::SweepCodes => composed!("common", "sweep_codes"),
+            Shader::Copy => composed!("common", "copy"),
         }
     }
 
@@ -168,11 +171,18 @@ impl Shader {
             Shader::Masked => &["fill"],
             Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
+            Shader::Copy => &["copy"],
             Shader::Extremes | Shader::Sums32 | Shader::Sums64 | Shader::Order | Shader::Moments => {
                 &["first", "next", "rows"]
             }
             _ => &["first", "next"],
         }
+    }
+
+    /// Whether `parts`, an overridable constant of it, says what is compiled: what nobody asks for takes registers, and threads
+    /// off the device.
+    pub fn has_parts(self) -> bool {
+        self == Shader::Codes
     }
 
     /// Storage bindings after the uniform one.

@@ -228,12 +228,9 @@ impl<'a> SweepJob<'a> {
         let reach = family.reach().min(planes - 1);
         let shifts = tables.len() as u32;
         let first = bounds.lo[order[0]];
-        for &axis in &order[1..] {
-            let start = family.displacement(axis, first);
-            let along = (first..first + planes as i64).map(|k| family.displacement(axis, k));
-            let before = std::iter::once(start).chain(along.clone());
-            tables.extend(along.zip(before).map(|(here, before)| (here - before) as i32 as u32));
-        }
+        let step = |axis: usize, k: i64| (family.displacement(axis, k) - family.displacement(axis, k - 1)) as u32;
+        let both = |k: i64| step(order[1], k) & 0xffff | step(order[2], k) << 16;
+        tables.extend([0].into_iter().chain((first + 1..first + planes as i64).map(both)));
         let starts = [0, 1].map(|way| match family.table(way) {
             None => NOT_SWEPT,
             Some(table) => {
@@ -319,7 +316,7 @@ mod tests {
         let mut tables = Vec::new();
         for family in sweep.lines() {
             let p = job.lines(&part, &family, &mut tables);
-            let shift = |k: usize, i: u32| tables[(p.shifts + k as u32 * p.planes + i) as usize] as i32;
+            let shift = |k: usize, i: u32| (tables[(p.shifts + i) as usize] >> (16 * k)) as i16 as i32;
             let bounds = job.family_box(&part, &family);
             let mut met = vec![0; bounds.voxels()];
             for line in 0..p.size[0] * p.size[1] {
