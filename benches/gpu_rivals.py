@@ -4,6 +4,7 @@
 
     pip install numpy scipy cupy-cuda12x torch
     cargo bench --bench gpu     # runs this script at its end
+    python3 benches/gpu_rivals.py [windows] [smooth] [torch]    # or parts of it: compiling CuPy's windows takes minutes
 
 The same extents, radii and types as the bench, noise, medians of ten after a warm-up, by events of the device; copies to
 and from the device are timed apart. CuPy with mode "nearest" and its default "reflect". torch pools floats only, pads with
@@ -41,8 +42,14 @@ def cupy_or_skip():
 
 
 def timed(cupy, call):
-    """Median milliseconds on the device."""
+    """Median milliseconds on the device, whose clock goes up with work."""
+    import time
+
     call()
+    end = time.perf_counter() + 0.1
+    while time.perf_counter() < end:
+        call()
+        cupy.cuda.Device().synchronize()
     times = []
     for _ in range(ROUNDS):
         begin, end = cupy.cuda.Event(), cupy.cuda.Event()
@@ -162,11 +169,12 @@ def main():
     print(f"{props['name'].decode()}, CuPy {cupy.__version__}, {SIZE}^3, medians of {ROUNDS}, ms")
     for name, ms in copies(cupy):
         print(f"{name:<60} {ms:8.3f}")
-    for name, dtype, radius, ms, note in rows_of_cupy(cupy, filters):
+    parts = set(sys.argv[1:]) or {"windows", "smooth", "torch"}
+    for name, dtype, radius, ms, note in rows_of_cupy(cupy, filters) if "windows" in parts else []:
         print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
-    for name, dtype, ms, note in smooth_rows(cupy, filters):
+    for name, dtype, ms, note in smooth_rows(cupy, filters) if "smooth" in parts else []:
         print(f"{name:<44} {dtype:<8} {ms:8.3f}  {note}")
-    for name, dtype, radius, ms, note in rows_of_torch(cupy):
+    for name, dtype, radius, ms, note in rows_of_torch(cupy) if "torch" in parts else []:
         print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
 
 

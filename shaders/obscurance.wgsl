@@ -7,13 +7,13 @@
 //
 // Agrees bit for bit with src/kernel/obscurance (integer sums). Parameters: src/gpu/sweep.rs, struct Lines; displacements
 // are integers that the CPU made in f64, and are never computed here.
-// A dispatch takes up to four families side by side, since the lines of one are too few to fill a large GPU; integers add up
+// A dispatch takes up to eight families side by side, since the lines of one are too few to fill a large GPU; integers add up
 // to the same sums in any order, so they are added by atomic operations. What a thread left at a voxel (an entry: its code, and
 // the steps to the next greater one) stands in one place of the links, first of the backward sense, then of the forward one.
-// The last `RING` planes' entries stand in workgroup memory, too, where most answers are found; each thread reads what it
-// wrote itself, so there is no barrier.
+// The nearest links of the chain ahead stand as a stack in workgroup memory, too, where almost every answer is found; each
+// thread reads what it wrote itself, so there is no barrier.
 //
-// A shader adds the type `Entry`, its `entry_of`, `code_of` and `step_of`, and `RING`.
+// A shader adds the type `Entry`, its `entry_of`, `code_of`, `step_of` and `is_beyond`, and `TOP`, the greatest code.
 // Bindings, group 0: 0 uniform Lines; 1 storage, read: packed codes; 2 storage, read and written: sums of the output box, which
 // start at 0; 3 storage, read: displacements and contributions; 4 storage, read and written: entries of each family,
 // [plane][thread].
@@ -50,7 +50,7 @@ struct Lines {
     spare_2: u32,
 }
 
-@group(0) @binding(0) var<uniform> families: array<Lines, 4>;
+@group(0) @binding(0) var<uniform> families: array<Lines, 8>;
 @group(0) @binding(1) var<storage, read> codes: array<u32>;
 @group(0) @binding(2) var<storage, read_write> sums: array<atomic<u32>>;
 @group(0) @binding(3) var<storage, read> tables: array<u32>;
@@ -60,9 +60,14 @@ const NOT_SWEPT: u32 = 0xffffffffu;
 // Steps of a voxel without a greater code ahead: more than there are planes.
 const NONE: u32 = 0xffffu;
 
+// Links of the chain that a thread has at hand, less one.
+const KEPT: u32 = 16u;
+
 var<private> p: Lines;
-// Of each thread the entries of the planes that it was at last, by their number modulo `RING`.
-var<workgroup> ring: array<Entry, RING * 64u>;
+// Of each thread a ring of codes and planes, every 64 entries one, each greater than the one above it; under the lowest an end.
+var<workgroup> stack: array<Entry, KEPT * 64u>;
+// Where the thread's highest one stands.
+var<private> highest: u32;
 
 fn code(plane: u32, at: vec2<i32>) -> u32 {
     let index = p.code_at + plane * p.code_a + u32(at.x) * p.code_b + u32(at.y) * p.code_c;
@@ -89,28 +94,57 @@ fn place_of(plane: u32, thread: u32) -> u32 {
     return p.links + plane * p.threads + thread;
 }
 
-fn leave(plane: u32, thread: u32, local: u32, entry: Entry) {
-    links[place_of(plane, thread)] = entry;
-    ring[(plane % RING) * 64u + local] = entry;
+// Empties the stack.
+fn forget() {
+    stack[highest] = entry_of(TOP, NONE);
 }
 
-// Steps from `plane` to the first greater code than `own`, no more than `room` planes away; `NONE` if there is none.
-fn seek(plane: u32, own: u32, room: u32, thread: u32, local: u32, way: i32) -> u32 {
-    var d = 1u;
-    let below = entry_of(own, 0xffffu);
+fn below_of(slot: u32) -> u32 {
+    return (slot - 64u) % (KEPT * 64u);
+}
+
+fn above_of(slot: u32) -> u32 {
+    return (slot + 64u) % (KEPT * 64u);
+}
+
+// A voxel with its answer, and onto the stack, which forgets its lowest when it is full.
+fn leave(plane: u32, thread: u32, own: u32, step: u32) {
+    links[place_of(plane, thread)] = entry_of(own, step);
+    highest = above_of(highest);
+    stack[highest] = entry_of(own, plane);
+    stack[above_of(highest)] = entry_of(TOP, NONE);
+}
+
+// Steps from `plane` to the first greater code than `own`, no more than `room` planes away; `NONE` if there is none. What is
+// not greater leaves the stack.
+fn seek(plane: u32, own: u32, room: u32, thread: u32, way: i32) -> u32 {
+    if own == TOP {
+        forget();
+        return NONE;
+    }
+    let below = entry_of(own, NONE);
+    var last = NONE; // plane of the lowest that was not greater
+    var entry = stack[highest];
+    for (var k = 0u; k < KEPT && !is_beyond(entry, below); k += 1u) {
+        last = step_of(entry);
+        highest = below_of(highest);
+        entry = stack[highest];
+    }
+    if step_of(entry) != NONE {
+        let d = u32(way * (i32(step_of(entry)) - i32(plane)));
+        return select(NONE, d, d <= room);
+    }
+    if last == NONE {
+        return NONE; // no voxel lies ahead on this line
+    }
+    // From the lowest on along its links; one without a greater code leads beyond all room.
+    var d = u32(way * (i32(last) - i32(plane))) + step_of(links[place_of(last, thread)]);
     while d <= room {
-        let other = u32(i32(plane) + way * i32(d));
-        var entry: Entry;
-        if d <= RING {
-            entry = ring[(other % RING) * 64u + local];
-        } else {
-            entry = links[place_of(other, thread)];
-        }
-        if is_beyond(entry, below) {
+        let far = links[place_of(u32(i32(plane) + way * i32(d)), thread)];
+        if is_beyond(far, below) {
             return d;
         }
-        // Without a greater one: beyond all room.
-        d += step_of(entry);
+        d += step_of(far);
     }
     return NONE;
 }
@@ -128,7 +162,7 @@ fn add_up(plane: u32, at: vec2<i32>, sum: u32) {
 
 // To the last plane, seeking backward on the way; returns the place there. The code of the next plane is asked for before this
 // one's answer is sought, so that it is there when it is needed.
-fn go(start: vec2<i32>, thread: u32, local: u32) -> vec2<i32> {
+fn go(start: vec2<i32>, thread: u32) -> vec2<i32> {
     var at = start;
     var own = code(0u, at);
     var room = 0u; // planes of this line that lie behind
@@ -141,10 +175,14 @@ fn go(start: vec2<i32>, thread: u32, local: u32) -> vec2<i32> {
         }
         var d = NONE;
         if p.backward != NOT_SWEPT {
-            d = seek(i, own, min(room, p.reach), thread, local, -1);
+            d = seek(i, own, min(room, p.reach), thread, -1);
         }
-        leave(i, thread, local, entry_of(own, d));
-        room = select(room + 1u, 0u, next.z == 1);
+        leave(i, thread, own, d);
+        room += 1u;
+        if next.z == 1 {
+            room = 0u;
+            forget();
+        }
         at = next.xy;
         own = ahead;
     }
@@ -152,7 +190,7 @@ fn go(start: vec2<i32>, thread: u32, local: u32) -> vec2<i32> {
 }
 
 // And back, seeking forward and adding up both.
-fn come(end: vec2<i32>, thread: u32, local: u32) {
+fn come(end: vec2<i32>, thread: u32) {
     var at = end;
     var here = links[place_of(p.planes - 1u, thread)];
     var room = 0u;
@@ -170,12 +208,16 @@ fn come(end: vec2<i32>, thread: u32, local: u32) {
             sum = contribution(p.backward, step_of(here));
         }
         if p.forward != NOT_SWEPT {
-            let d = seek(i, own, min(room, p.reach), thread, local, 1);
-            leave(i, thread, local, entry_of(own, d));
+            let d = seek(i, own, min(room, p.reach), thread, 1);
+            leave(i, thread, own, d);
             sum += contribution(p.forward, d);
         }
         add_up(i, at, sum);
-        room = select(room + 1u, 0u, next.z == 1);
+        room += 1u;
+        if next.z == 1 {
+            room = 0u;
+            forget();
+        }
         at = next.xy;
         here = ahead;
     }
@@ -186,7 +228,7 @@ fn sweep(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) group
          @builtin(local_invocation_index) local: u32) {
     let number = group.y * groups.x + group.x;
     let family = number / families[0].groups;
-    if family > 3u {
+    if family > 7u {
         return;
     }
     p = families[family];
@@ -195,6 +237,9 @@ fn sweep(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) group
         return;
     }
     let line = p.first + thread;
-    let end = go(vec2<i32>(i32(line / p.size_c), i32(line % p.size_c)), thread, local);
-    come(end, thread, local);
+    highest = local;
+    forget();
+    let end = go(vec2<i32>(i32(line / p.size_c), i32(line % p.size_c)), thread);
+    forget();
+    come(end, thread);
 }

@@ -2,7 +2,7 @@
 
 alias Entry = u32;
 
-const RING: u32 = 32u;
+const TOP: u32 = 0xffffu;
 
 fn entry_of(code: u32, step: u32) -> Entry {
     return (code << 16u) | step;

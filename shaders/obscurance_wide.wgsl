@@ -2,7 +2,7 @@
 
 alias Entry = vec2<u32>;
 
-const RING: u32 = 32u;
+const TOP: u32 = 0xffffffffu;
 
 fn entry_of(code: u32, step: u32) -> Entry {
     return Entry(code, step);

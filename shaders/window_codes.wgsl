@@ -151,24 +151,42 @@ fn of_difference(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     return of_integer(minus64(a, b));
 }
 
-// The f32 nearest to d / n, half to even, of a positive integer and a count below 2^28: between a quotient of such a count and
-// a number halfway between two f32 lie more than 2^-53 of it, so that rounding to f64 first would change nothing.
+// The f32 nearest to d / n, half to even, of a count n below 2^28 and an integer d below 2^16 n: from a quotient in f32 that is a few units in the last place off, which the rest puts right. The rest is small, so
+// its low word is all of it. Rounding to f64 first would change nothing, since between a quotient of such a count and a number
+// halfway between two f32 lie more than 2^-53 of it.
 fn nearest(d: vec2<u32>, n: u32) -> u32 {
     if (d.x | d.y) == 0u {
         return 0u;
     }
-    let by_d = zeros64(d);
-    let by_n = countLeadingZeros(n);
-    let half = divided(right64(left64(d, by_d), 1u), n << by_n);
-    let top = countLeadingZeros(half.quotient); // 0 or 1
-    let m = (half.quotient << top) | select(0u, 1u, half.rest != 0u);
-    var kept = m >> 8u;
-    let rest = m & 255u;
-    if rest > 128u || (rest == 128u && (kept & 1u) == 1u) {
-        kept += 1u;
+    let by = f32(n);
+    let guess = bitcast<u32>((f32(d.y) * 4294967296.0 + f32(d.x)) / by);
+    var exponent = guess >> 23u;
+    var m = (guess & 0x7fffffu) | 0x800000u;
+    // d / n = m 2^(exponent - 150) and the rest; the quotient of codes is below 2^16, so that d moves to the left.
+    let shift = 150u - exponent;
+    var rest = bitcast<i32>(select(d.x << (shift & 31u), 0u, shift > 31u) - m * n);
+    let off = i32(floor(f32(rest) / by + 0.5));
+    m += u32(off);
+    rest -= off * i32(n);
+    if m < 0x800000u || (m == 0x800000u && rest < 0) {
+        // Below a power of two numbers are half as far apart. m may be as small as 2^23 - 4.
+        m *= 2u;
+        rest *= 2;
+        exponent -= 1u;
     }
+    var unit = i32(n);
+    if m > 0x1000000u || (m == 0x1000000u && rest >= 0) {
+        // And from one on twice as far.
+        rest += select(0, i32(n), (m & 1u) == 1u);
+        unit *= 2;
+        m /= 2u;
+        exponent += 1u;
+    }
+    let odd = (m & 1u) == 1u;
+    m += select(0u, 1u, 2 * rest > unit || (2 * rest == unit && odd));
+    m -= select(0u, 1u, 2 * rest < -unit || (2 * rest == -unit && odd));
     // The leading bit adds one to the exponent.
-    return kept + ((158u + by_n - by_d - top) << 23u);
+    return m + ((exponent - 1u) << 23u);
 }
 
 // The mean of values that are not scaled, as f32.
@@ -305,7 +323,9 @@ fn finish_at(z: u32, y: u32, x: u32) {
     let voxel = (z * p.out_y + y) * p.out_x + x;
     let index = p.centre + z * p.in_z + y * p.in_y + x;
     var w = Window();
-    w.v = unpacked(voxels[index >> p.packing], index, p.packing) ^ p.flip;
+    if (parts & 12u) != 0u {
+        w.v = unpacked(voxels[index >> p.packing], index, p.packing) ^ p.flip;
+    }
     w.n = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_y + y, p.radius_y, p.size_y)
         * along(p.at_x + x, p.radius_x, p.size_x);
     if (p.needs & 4u) != 0u {

@@ -2,49 +2,60 @@
 
 alias Cell = Seen;
 
-// Voxel q of a row, counted from the start of window 0; nothing where it does not exist.
-fn seen_of(row: u32, q: i32) -> Seen {
-    let i = q + p.first;
-    if row < p.lines && i >= 0 && i < i32(p.n) {
-        return seen_at(row * p.in_i + u32(i), false);
+// Whether voxel q of rows exists, counted from the start of window 0.
+fn is_there(q: i32) -> bool {
+    return q + p.first >= 0 && q + p.first < i32(p.n);
+}
+
+// Brings voxel q + column of 64 rows.
+fn bring(first: u32, q: i32, local: u32, into_made: bool) {
+    let there = is_there(q + column_of(local));
+    let at = u32(clamp(q + column_of(local) + p.first, 0, i32(p.n) - 1));
+    for (var k = 0u; k < COLUMNS; k += 2u) {
+        let r = row_of(local) + k * APART;
+        var a = seen_at(start_of(first, r, p.in_i) + at, false);
+        var b = seen_at(start_of(first, r + APART, p.in_i) + at, false);
+        if !there {
+            a = nothing();
+            b = nothing();
+        }
+        let slot = slot_of(r, u32(column_of(local)));
+        let other = slot_of(r + APART, u32(column_of(local)));
+        if into_made {
+            made[slot] = a;
+            made[other] = b;
+        } else {
+            ahead[slot] = a;
+            ahead[other] = b;
+        }
     }
-    return nothing();
 }
 
-// Entries k, k + 64, ... of a tile whose column 0 is voxel q.
-fn seen_of_batch(first: u32, k: u32, q: i32) -> array<Seen, BATCH> {
-    return array<Seen, BATCH>(
-        seen_of(first + row_of(k), q + i32(column_of(k))),
-        seen_of(first + row_of(k + 64u), q + i32(column_of(k + 64u))),
-        seen_of(first + row_of(k + 128u), q + i32(column_of(k + 128u))),
-        seen_of(first + row_of(k + 192u), q + i32(column_of(k + 192u))),
-    );
-}
-
-// What was kept at output o of a row; nothing where it does not exist or lies beyond `high`.
-fn kept_of(row: u32, o: i32, high: i32) -> Seen {
-    if row < p.lines && o >= 0 && o < high {
-        return kept(row * p.out_i + u32(o));
+// Brings what was kept at output o + column of 64 rows, from 0 on and before `high`.
+fn bring_kept(first: u32, o: i32, high: i32, local: u32) {
+    let to = o + column_of(local);
+    if to < 0 || to >= high {
+        return;
     }
-    return nothing();
-}
-
-fn kept_of_batch(first: u32, k: u32, o: i32, high: i32) -> array<Seen, BATCH> {
-    return array<Seen, BATCH>(
-        kept_of(first + row_of(k), o + i32(column_of(k)), high),
-        kept_of(first + row_of(k + 64u), o + i32(column_of(k + 64u)), high),
-        kept_of(first + row_of(k + 128u), o + i32(column_of(k + 128u)), high),
-        kept_of(first + row_of(k + 192u), o + i32(column_of(k + 192u)), high),
-    );
+    for (var k = 0u; k < COLUMNS; k += 2u) {
+        let r = row_of(local) + k * APART;
+        let a = kept(start_of(first, r, p.out_i) + u32(to));
+        let b = kept(start_of(first, r + APART, p.out_i) + u32(to));
+        made[slot_of(r, u32(column_of(local)))] = a;
+        made[slot_of(r + APART, u32(column_of(local)))] = b;
+    }
 }
 
 // What `made` holds of 64 rows from output `o` on, to those from `low` on and before `high`.
 fn keep_tile(first: u32, o: i32, low: i32, high: i32, local: u32) {
-    for (var k = local; k < 64u * COLUMNS; k += 64u) {
-        let row = first + row_of(k);
-        let to = o + i32(column_of(k));
-        if row < p.lines && to >= low && to < high {
-            keep(row * p.out_i + u32(to), made[slot_of(row_of(k), column_of(k))]);
+    let to = o + column_of(local);
+    if to < low || to >= high {
+        return;
+    }
+    for (var k = 0u; k < COLUMNS; k += 1u) {
+        let r = row_of(local) + k * APART;
+        if first + r < p.lines {
+            keep((first + r) * p.out_i + u32(to), made[slot_of(r, u32(column_of(local)))]);
         }
     }
 }
@@ -62,9 +73,7 @@ fn walk_rows(first: u32, span: i32, local: u32) {
     for (var high = top; high > bottom; high -= step) {
         let low = high - step;
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
-            bring_made(k, seen_of_batch(first, k, low));
-        }
+        bring(first, low, local, true);
         workgroupBarrier();
         var place = (high - 1 - start) % w;
         for (var c = COLUMNS; c > 0u; c -= 1u) {
@@ -85,12 +94,8 @@ fn walk_rows(first: u32, span: i32, local: u32) {
     let last = min(stop, m);
     for (var o = start; o < last; o += step) {
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
-            let come = seen_of_batch(first, k, o + w - 1);
-            let before = kept_of_batch(first, k, o, last);
-            bring_ahead(k, come);
-            bring_made(k, before);
-        }
+        bring(first, o + w - 1, local, false);
+        bring_kept(first, o, last, local);
         workgroupBarrier();
         var place = (o - start) % w;
         for (var c = 0u; c < COLUMNS; c += 1u) {

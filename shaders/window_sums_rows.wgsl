@@ -2,48 +2,68 @@
 
 alias Cell = Sum;
 
-// Voxel q of a row, counted from the start of window 0; nothing where it lies before `low` or beyond `high`, or does not exist.
-fn seen_of(row: u32, q: i32, low: i32, high: i32) -> Sum {
-    let i = q + p.first;
-    let there = q >= low && q < high && i >= 0 && i < i32(p.n);
-    let place = min(row, p.lines - 1u) * p.in_i + u32(clamp(i, 0, i32(p.n) - 1));
-    return select(Sum(), term(place, false), there);
+// Where voxel q of a row stands in it, counted from the start of window 0, and whether it is there and within low .. high.
+struct Seen {
+    at: u32,
+    there: bool,
 }
 
-// Entries k, k + 64, ... of a tile whose column 0 is voxel q.
-fn seen_of_batch(first: u32, k: u32, q: i32, low: i32, high: i32) -> array<Sum, BATCH> {
-    return array<Sum, BATCH>(
-        seen_of(first + row_of(k), q + i32(column_of(k)), low, high),
-        seen_of(first + row_of(k + 64u), q + i32(column_of(k + 64u)), low, high),
-        seen_of(first + row_of(k + 128u), q + i32(column_of(k + 128u)), low, high),
-        seen_of(first + row_of(k + 192u), q + i32(column_of(k + 192u)), low, high),
-    );
+fn seen_of(q: i32, low: i32, high: i32) -> Seen {
+    let i = q + p.first;
+    let there = q >= low && q < high && i >= 0 && i < i32(p.n);
+    return Seen(u32(clamp(i, 0, i32(p.n) - 1)), there);
+}
+
+fn term_of(start: u32, seen: Seen) -> Sum {
+    return select(Sum(), term(start + seen.at, false), seen.there);
 }
 
 fn walk_rows(first: u32, span: i32, local: u32) {
     let w = i32(p.window);
-    let start = span * i32(p.block);
-    let end = min(start + i32(p.block), i32(p.m));
+    let begin = span * i32(p.block);
+    let end = min(begin + i32(p.block), i32(p.m));
     let step = i32(COLUMNS);
+    let row = row_of(local);
+    let column = column_of(local);
     var sum = Sum();
     // The first window but its last voxel.
-    for (var q = start; q < start + w - 1; q += step) {
+    for (var q = begin; q < begin + w - 1; q += step) {
+        let seen = seen_of(q + column, begin, begin + w - 1);
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
-            bring_ahead(k, seen_of_batch(first, k, q, start, start + w - 1));
+        for (var k = 0u; k < COLUMNS; k += 4u) {
+            let r = row + k * APART;
+            let a = term_of(start_of(first, r, p.in_i), seen);
+            let b = term_of(start_of(first, r + APART, p.in_i), seen);
+            let c = term_of(start_of(first, r + 2u * APART, p.in_i), seen);
+            let d = term_of(start_of(first, r + 3u * APART, p.in_i), seen);
+            ahead[slot_of(r, u32(column))] = a;
+            ahead[slot_of(r + APART, u32(column))] = b;
+            ahead[slot_of(r + 2u * APART, u32(column))] = c;
+            ahead[slot_of(r + 3u * APART, u32(column))] = d;
         }
         workgroupBarrier();
         for (var c = 0u; c < COLUMNS; c += 1u) {
             sum = plus(sum, ahead[slot_of(local, c)]);
         }
     }
-    for (var o = start; o < end; o += step) {
+    for (var o = begin; o < end; o += step) {
+        let come = seen_of(o + column + w - 1, begin, end + w);
+        let gone = seen_of(o + column - 1, begin, end);
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u * BATCH) {
-            let come = seen_of_batch(first, k, o + w - 1, start, end + w);
-            let gone = seen_of_batch(first, k, o - 1, start, end);
-            bring_ahead(k, come);
-            bring_made(k, gone);
+        for (var k = 0u; k < COLUMNS; k += 2u) {
+            let r = row + k * APART;
+            let start = start_of(first, r, p.in_i);
+            let next = start_of(first, r + APART, p.in_i);
+            let a = term_of(start, come);
+            let b = term_of(next, come);
+            let c = term_of(start, gone);
+            let d = term_of(next, gone);
+            let slot = slot_of(r, u32(column));
+            let other = slot_of(r + APART, u32(column));
+            ahead[slot] = a;
+            ahead[other] = b;
+            made[slot] = c;
+            made[other] = d;
         }
         workgroupBarrier();
         for (var c = 0u; c < COLUMNS; c += 1u) {
@@ -52,11 +72,12 @@ fn walk_rows(first: u32, span: i32, local: u32) {
             made[slot] = sum;
         }
         workgroupBarrier();
-        for (var k = local; k < 64u * COLUMNS; k += 64u) {
-            let row = first + row_of(k);
-            let to = o + i32(column_of(k));
-            if row < p.lines && to < end {
-                output[row * p.out_i + u32(to)] = made[slot_of(row_of(k), column_of(k))];
+        if o + column < end {
+            for (var k = 0u; k < COLUMNS; k += 1u) {
+                let r = row + k * APART;
+                if first + r < p.lines {
+                    output[(first + r) * p.out_i + u32(o + column)] = made[slot_of(r, u32(column))];
+                }
             }
         }
     }

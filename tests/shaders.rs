@@ -30,8 +30,7 @@ fn translated(text: &str) -> Result<(Vec<u32>, String, String), String> {
     let (module, info) = (settled.0.as_ref(), settled.1.as_ref());
     let spv = spv::write_vec(module, info, &spv::Options::default(), None).map_err(|e| format!("SPIR-V: {e}"))?;
     let (options, of_pipeline) = (msl::Options::default(), msl::PipelineOptions::default());
-    let (metal, entries) =
-        msl::write_string(module, info, &options, &of_pipeline).map_err(|e| format!("MSL: {e}"))?;
+    let (metal, entries) = msl::write_string(module, info, &options, &of_pipeline).map_err(|e| format!("MSL: {e}"))?;
     entries.entry_point_names.into_iter().collect::<Result<Vec<_>, _>>().map_err(|e| format!("MSL: {e}"))?;
     let mut direct = String::new();
     let (options, of_pipeline) = (hlsl::Options::default(), hlsl::PipelineOptions::default());

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::backend;
 use super::device::{self, Device, Kind, SlotGuard};
 use super::facts::{GpuFacts, GpuKind};
-use super::record::{Command, Dispatch, PARAMS_STRIDE, Recording, STAMP_BYTES, STAMPS, groups};
+use super::record::{Command, Dispatch, Recording, STAMP_BYTES, STAMPS, groups};
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
 /// stays silent for longer is taken for lost.
@@ -295,9 +295,8 @@ fn write(buffer: &wgpu::Buffer, recording: &Recording, fill: Fill) -> Result<boo
     let sizes = recording.sizes;
     let view = buffer.get_mapped_range_mut(0..sizes.upload());
     let mut view = view.map_err(|e| GpuError(format!("cannot write voxels: {e:?}")))?;
-    for (k, dispatch) in recording.dispatches().enumerate() {
-        let from = k * PARAMS_STRIDE as usize;
-        view.slice(from..from + dispatch.params.len()).copy_from_slice(&dispatch.params);
+    for (dispatch, at) in recording.dispatches().zip(recording.params()) {
+        view.slice(at.start as usize..at.end as usize).copy_from_slice(&dispatch.params);
     }
     let tables: &[u8] = bytemuck::cast_slice(&recording.tables);
     let from = sizes.params as usize;
@@ -328,17 +327,17 @@ fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::Sub
         from += bytes;
     }
     stamp(&mut encoder, 1);
-    let mut number = 0;
+    let mut params = recording.params();
     if stamps.is_some() && each(compute) {
         for (command, k) in compute.chunks(1).zip(2..) {
-            encode(device, held, command, &mut number, &mut encoder);
+            encode(device, held, command, &mut params, &mut encoder);
             stamp(&mut encoder, k);
         }
     } else {
-        encode(device, held, compute, &mut number, &mut encoder);
+        encode(device, held, compute, &mut params, &mut encoder);
         stamp(&mut encoder, 2);
     }
-    encode(device, held, back, &mut number, &mut encoder);
+    encode(device, held, back, &mut params, &mut encoder);
     stamp(&mut encoder, count - 1);
     if let Some(set) = &stamps {
         let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
@@ -351,12 +350,12 @@ fn submit(device: &Device, held: &SlotGuard, recording: &Recording) -> wgpu::Sub
     device.queue.submit([encoder.finish()])
 }
 
-/// Commands in their order; dispatches in a row share a pass. `number` counts dispatches: their place among parameters.
+/// Commands in their order; dispatches in a row share a pass. `params` says where those of the next dispatch stand.
 fn encode(
     device: &Device,
     held: &SlotGuard,
     commands: &[Command],
-    number: &mut u64,
+    params: &mut impl Iterator<Item = std::ops::Range<u64>>,
     encoder: &mut wgpu::CommandEncoder,
 ) {
     let slot = &held.slot;
@@ -369,9 +368,9 @@ fn encode(
             Command::Dispatch(_) => {
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
                 for command in run {
-                    let Command::Dispatch(d) = command else { continue };
-                    dispatch(device, held, d, *number * PARAMS_STRIDE, &mut pass);
-                    *number += 1;
+                    if let (Command::Dispatch(d), Some(at)) = (command, params.next()) {
+                        dispatch(device, held, d, at.start, &mut pass);
+                    }
                 }
             }
         }

@@ -3,9 +3,8 @@
 
 pub use super::shaders::Shader;
 
-/// Bytes between the parameters of dispatches in their buffer, which are at most as many (a multiple of the largest alignment
-/// that an adapter may ask for, 256).
-pub const PARAMS_STRIDE: u64 = 512;
+/// Most bytes of parameters of a dispatch, which every adapter binds.
+pub const MOST_PARAMS: u64 = 1024;
 /// Most time stamps of a part, and room for them behind the results.
 pub const STAMPS: usize = 256;
 pub const STAMP_BYTES: u64 = 8 * STAMPS as u64;
@@ -91,9 +90,19 @@ impl Recording {
         })
     }
 
+    /// Where the parameters of each dispatch stand in their buffer, from multiples of 256 bytes on.
+    pub fn params(&self) -> impl Iterator<Item = std::ops::Range<u64>> {
+        let mut end = 0;
+        self.dispatches().map(move |d| {
+            let start = end;
+            end += rounded(d.params.len() as u64);
+            start..start + d.params.len() as u64
+        })
+    }
+
     /// What is wrong with it, if anything: bindings that a shader lacks or that alias, copies beyond a buffer's end.
     pub fn fault(&self) -> Option<String> {
-        if self.dispatches().count() as u64 * PARAMS_STRIDE > self.sizes.params {
+        if self.params().last().map_or(0, |p| p.end) > self.sizes.params {
             return Some("too little room for parameters".into());
         }
         if self.tables.len() as u64 * 4 > self.sizes.tables {
@@ -123,7 +132,7 @@ impl Recording {
         if d.bind.len() != d.shader.bindings() || d.entry >= d.shader.entries().len() || twice {
             return Some(format!("{}: bindings {:?}, entry {}", d.shader.name(), d.bind, d.entry));
         }
-        if d.params.len() as u64 > PARAMS_STRIDE || d.threads == 0 {
+        if d.params.len() as u64 > MOST_PARAMS || d.threads == 0 {
             return Some(format!("{}: {} threads", d.shader.name(), d.threads));
         }
         if d.bind.iter().any(|b| b.from % 256 != 0 || b.from >= self.sizes.of(b.buffer)) {
@@ -208,7 +217,7 @@ mod tests {
     fn faults_are_seen() {
         let mut work = [0; WORK];
         work[0] = 512;
-        let sizes = Sizes { params: PARAMS_STRIDE, tables: 256, source: 256, work, read: 512 };
+        let sizes = Sizes { params: 256, tables: 256, source: 256, work, read: 512 };
         let a = Buffer::Work(0);
         let dispatch = |bind: &[Buffer]| {
             let (shader, params) = (Shader::Sums32, vec![0; 80]);

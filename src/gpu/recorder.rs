@@ -1,9 +1,7 @@
 //! Puts recordings together: buffers taken and given back, tables, dispatches, what comes back. Steps that are recorded one
 //! after the other share buffers, since each gives back what nobody reads any more.
 
-use super::record::{
-    Bind, Buffer, Command, Dispatch, FLAG_BYTES, PARAMS_STRIDE, Readback, Recording, Shader, Sizes, WORK, rounded,
-};
+use super::record::{Bind, Buffer, Command, Dispatch, FLAG_BYTES, Readback, Recording, Shader, Sizes, WORK, rounded};
 use super::unfit::Unfit;
 
 /// A recording in the making.
@@ -98,10 +96,9 @@ impl Recorder {
         if self.busy.len() > WORK {
             return Err(Unfit::Buffers(self.busy.len()));
         }
+        let params = self.recording.params().last().map_or(0, |p| p.end);
         let sizes = &mut self.recording.sizes;
-        sizes.params = (self.recording.commands.iter().filter(|c| matches!(c, Command::Dispatch(_))).count() as u64)
-            .max(1)
-            * PARAMS_STRIDE;
+        sizes.params = rounded(params);
         sizes.tables = rounded(self.recording.tables.len() as u64 * 4);
         Ok(self.recording)
     }

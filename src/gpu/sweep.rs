@@ -37,9 +37,9 @@ pub struct Lines {
 }
 
 /// Most families of one dispatch, whose parameters are an array of as many.
-const TOGETHER: usize = 4;
-/// Threads that fill a large GPU (132 x 2048 on an H200): families go side by side up to as many.
-const ENOUGH: usize = 1 << 18;
+const TOGETHER: usize = 8;
+/// Threads that fill a large GPU twice (132 x 2048 on an H200): families go side by side up to as many.
+const ENOUGH: usize = 1 << 19;
 
 /// How voxels become codes; `struct Keys` of `shaders/sweep_codes.wgsl`, which explains the fields.
 #[repr(C)]
