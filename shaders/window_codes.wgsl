@@ -41,8 +41,9 @@ struct Codes {
     channels: array<vec4<u32>, 4>, // what each is, and 256 where constant windows are half open
 }
 
-// What is compiled: 1 results in f64, 2 numerators of variances, 4 openness by powers, 8 by spreads.
-override parts: u32 = 15u;
+// What is compiled: 1 results in f64, 2 numerators of variances, 4 openness by powers, 8 by spreads, 16 counts
+// of voxels.
+override parts: u32 = 31u;
 
 // Divisions that find a thread's place cost as much as a voxel.
 const STRIP: u32 = 4u;
@@ -326,8 +327,10 @@ fn finish_at(z: u32, y: u32, x: u32) {
     if (parts & 12u) != 0u {
         w.v = unpacked(voxels[index >> p.packing], index, p.packing) ^ p.flip;
     }
-    w.n = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_y + y, p.radius_y, p.size_y)
-        * along(p.at_x + x, p.radius_x, p.size_x);
+    if (parts & 16u) != 0u {
+        w.n = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_y + y, p.radius_y, p.size_y)
+            * along(p.at_x + x, p.radius_x, p.size_x);
+    }
     if (p.needs & 4u) != 0u {
         w.lo = extremes[voxel] & 0xffffu;
         w.hi = extremes[voxel] >> 16u;

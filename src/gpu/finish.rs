@@ -183,7 +183,9 @@ impl Channels {
         to.dispatch(Shader::Codes, 0, &codes, &[source[0], source[1], extremes, sums, squares], threads);
         let exact = mean || scaled || self.asks(&[3, 4, 5]);
         let spread = [7, 8, 9].iter().any(|c| self.asks(&[*c, c + 256]));
-        to.only(exact as u32 + 2 * job.needs.variance as u32 + 4 * self.asks(&[6, 262]) as u32 + 8 * spread as u32);
+        let power = self.asks(&[6, 262]);
+        let parts = [exact, job.needs.variance, power, spread, job.needs.mean || job.needs.variance];
+        to.only(parts.iter().enumerate().map(|(k, part)| (*part as u32) << k).sum());
         planes
     }
 }
