@@ -4,7 +4,7 @@
 
     pip install numpy scipy cupy-cuda12x torch
     cargo bench --bench gpu     # runs this script at its end
-    python3 benches/gpu_rivals.py [windows] [smooth] [torch]    # or parts of it: compiling CuPy's windows takes minutes
+    python3 benches/gpu_rivals.py [windows] [smooth] [torch] [uint8] ...    # parts: compiling CuPy's windows takes minutes
 
 The same extents, radii and types as the bench, noise, medians of ten after a warm-up, by events of the device; copies to
 and from the device are timed apart. CuPy with mode "nearest" and its default "reflect". torch pools floats only, pads with
@@ -19,6 +19,7 @@ import statistics
 import sys
 
 SIZE, ROUNDS = 256, 10
+TYPES = ["uint8", "uint16", "float32"]
 
 
 def skip(why):
@@ -74,7 +75,7 @@ def agrees(cupy, filters, name, radius, mode, dtype):
 
 def rows_of_cupy(cupy, filters):
     rng = cupy.random.default_rng(1)
-    for dtype in ["uint8", "uint16", "float32"]:
+    for dtype in TYPES:
         v = rng.integers(0, 256 if dtype == "uint8" else 65536, (SIZE,) * 3).astype(dtype)
         out = cupy.empty_like(v)
         for radius in [10, 40]:
@@ -94,7 +95,7 @@ def smooth_rows(cupy, filters):
 
     small = np.random.default_rng(4).integers(0, 200, (31, 40, 53)).astype("float32")
     rng = cupy.random.default_rng(5)
-    for dtype in ["uint8", "uint16"]:
+    for dtype in [t for t in TYPES if t != "float32"]:
         v = rng.integers(0, 256 if dtype == "uint8" else 65536, (SIZE,) * 3).astype(dtype)
         out = cupy.empty(v.shape, "float32")
 
@@ -170,6 +171,8 @@ def main():
     for name, ms in copies(cupy):
         print(f"{name:<60} {ms:8.3f}")
     parts = set(sys.argv[1:]) or {"windows", "smooth", "torch"}
+    global TYPES
+    TYPES = [t for t in TYPES if t in parts] or TYPES
     for name, dtype, radius, ms, note in rows_of_cupy(cupy, filters) if "windows" in parts else []:
         print(f"{name:<32} {dtype:<8} r={radius:<3} {ms:8.3f}  {note}")
     for name, dtype, ms, note in smooth_rows(cupy, filters) if "smooth" in parts else []:

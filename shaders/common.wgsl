@@ -5,6 +5,12 @@ fn thread_of(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
     return (group.y * groups.x + group.x) * 64u + local;
 }
 
+// Threads of a dispatch: of one that has more to do than a device holds threads, each does every so manieth piece of work, since
+// starting a workgroup takes as long as a voxel's work.
+fn all_threads(groups: vec3<u32>) -> u32 {
+    return groups.x * groups.y * 64u;
+}
+
 // The bits of element `index` among the 2^packing in its word, the first in the low bits.
 fn unpacked(word: u32, index: u32, packing: u32) -> u32 {
     let bits = 32u >> packing;

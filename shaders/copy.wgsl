@@ -18,8 +18,7 @@ struct Copy {
 @compute @workgroup_size(64)
 fn copy(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
         output[thread] = input[thread];
     }
 }

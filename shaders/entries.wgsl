@@ -4,8 +4,7 @@
 @compute @workgroup_size(64)
 fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
          @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
         one(thread, true);
     }
 }
@@ -13,8 +12,7 @@ fn first(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) group
 @compute @workgroup_size(64)
 fn next(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread < p.threads {
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
         one(thread, false);
     }
 }

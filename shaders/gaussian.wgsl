@@ -37,7 +37,8 @@ fn smooth_at(at: Centre, packed: bool) {
     // Each step brings a voxel into both.
     var low = c;
     var high = c;
-    let inside = at.before >= p.radius && at.after >= p.radius + 3u;
+    // Along x every row of threads has ends.
+    let inside = p.axis != 2u && at.before >= p.radius && at.after >= p.radius + 3u;
     for (var d = 1u; inside && d <= p.radius; d += 1u) {
         low = vec4<f32>(value(at.here - d * by, packed), low.xyz);
         high = vec4<f32>(high.yzw, value(at.here + (d + 3u) * by, packed));

@@ -103,13 +103,7 @@ fn length_of(g: vec3<f32>) -> f32 {
     return (root + (sum - root * root) * (0.5 / root)) * bitcast<f32>(exponent << 23u);
 }
 
-@compute @workgroup_size(64)
-fn slopes(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-          @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread >= p.threads {
-        return;
-    }
+fn slope_at(thread: u32) {
     let x = thread % p.out_x;
     let y = (thread / p.out_x) % p.out_y;
     let z = thread / (p.out_x * p.out_y);
@@ -141,5 +135,13 @@ fn slopes(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
         output[2u * p.stride + thread] = select(bitcast<u32>(g.z), MARKED, marked);
     } else {
         output[thread] = select(bitcast<u32>(length_of(g)), MARKED, marked);
+    }
+}
+
+@compute @workgroup_size(64)
+fn slopes(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+          @builtin(local_invocation_index) local: u32) {
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
+        slope_at(thread);
     }
 }

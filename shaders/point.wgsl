@@ -228,16 +228,18 @@ fn made(v: array<vec2<u32>, 3>) -> vec2<u32> {
     }
 }
 
-@compute @workgroup_size(64)
-fn point(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-         @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread >= p.threads {
-        return;
-    }
+fn make(thread: u32) {
     var v: array<vec2<u32>, 3>;
     for (var c = 0u; c < p.inputs; c += 1u) {
         v[c] = input_of(thread, c);
     }
     output[thread] = narrowed(made(v));
+}
+
+@compute @workgroup_size(64)
+fn point(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+         @builtin(local_invocation_index) local: u32) {
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
+        make(thread);
+    }
 }

@@ -46,7 +46,7 @@ struct Codes {
 override parts: u32 = 31u;
 
 // Divisions that find a thread's place cost as much as a voxel.
-const STRIP: u32 = 4u;
+const STRIP: u32 = 8u;
 
 @group(0) @binding(0) var<uniform> p: Codes;
 @group(0) @binding(1) var<storage, read> voxels: array<u32>;
@@ -192,6 +192,9 @@ fn nearest(d: vec2<u32>, n: u32) -> u32 {
 
 // The mean of values that are not scaled, as f32.
 fn plain_mean(w: Window) -> u32 {
+    if p.flip == 0u {
+        return nearest(w.s1, w.n);
+    }
     let shift = times32(w.n, p.flip);
     if less64(w.s1, shift) {
         return SIGN | nearest(minus64(shift, w.s1), w.n);
@@ -308,15 +311,13 @@ fn result(w: Window, channel: u32) -> u32 {
 @compute @workgroup_size(64)
 fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
           @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread >= p.threads {
-        return;
-    }
-    let x = thread % p.out_x;
-    let first = (thread / p.out_x) % p.strips * STRIP;
-    let z = thread / (p.out_x * p.strips);
-    for (var y = first; y < min(first + STRIP, p.out_y); y += 1u) {
-        finish_at(z, y, x);
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
+        let x = thread % p.out_x;
+        let first = (thread / p.out_x) % p.strips * STRIP;
+        let z = thread / (p.out_x * p.strips);
+        for (var y = first; y < min(first + STRIP, p.out_y); y += 1u) {
+            finish_at(z, y, x);
+        }
     }
 }
 

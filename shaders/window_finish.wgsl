@@ -112,13 +112,7 @@ fn result(w: Window, channel: u32) -> f32 {
     }
 }
 
-@compute @workgroup_size(64)
-fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-          @builtin(local_invocation_index) local: u32) {
-    let thread = thread_of(group, groups, local);
-    if thread >= p.threads {
-        return;
-    }
+fn finish_at(thread: u32) {
     let x = thread % p.out_x;
     let y = (thread / p.out_x) % p.out_y;
     let z = thread / (p.out_x * p.out_y);
@@ -142,5 +136,13 @@ fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
             made = bitcast<u32>(result(w, p.channels[c / 4u][c % 4u]));
         }
         output[c * p.stride + thread] = made;
+    }
+}
+
+@compute @workgroup_size(64)
+fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+          @builtin(local_invocation_index) local: u32) {
+    for (var thread = thread_of(group, groups, local); thread < p.threads; thread += all_threads(groups)) {
+        finish_at(thread);
     }
 }

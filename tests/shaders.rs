@@ -67,6 +67,10 @@ fn every_shader_is_valid() {
                 failures += &format!("{name}: binding {k} is not for {access}\n");
             }
         }
+        let goes_on = shader.text().contains("thread += all_threads(groups)");
+        if (0..shader.entries().len()).any(|e| shader.goes_on(e)) != goes_on {
+            failures += &format!("{name}: whether its threads go on\n");
+        }
         for word in ["Bindings", "Workgroup", "Agrees"] {
             if !shader.text().contains(word) {
                 failures += &format!("{name}: the head does not state: {word}\n");

@@ -390,6 +390,6 @@ fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, pass: 
     let bind = device.device.create_bind_group(&desc);
     pass.set_pipeline(&kernel.pipeline);
     pass.set_bind_group(0, &bind, &[]);
-    let [x, y] = groups(d.threads);
+    let [x, y] = groups(d.shader, d.entry, d.threads);
     pass.dispatch_workgroups(x, y, 1);
 }

@@ -12,7 +12,7 @@ use crate::stage::{Method, Ties, WindowChannel, WindowParams};
 pub const MOST: usize = 16;
 
 /// Rows of voxels of a thread; the shader's `STRIP`.
-const STRIP: usize = 4;
+const STRIP: usize = 8;
 /// Voxels of windows from which on means go through f64; the shader's `is_plain`.
 const NEAREST: u64 = 1 << 28;
 

@@ -185,6 +185,12 @@ impl Shader {
         self == Shader::Codes
     }
 
+    /// Whether a thread of this entry that has done its work goes on to the next, as many threads on as there are.
+    pub fn goes_on(self, entry: usize) -> bool {
+        let alone = matches!(self, Shader::Codes | Shader::Finish | Shader::Point | Shader::Gradient | Shader::Copy);
+        alone || matches!(self.entries()[entry], "first" | "next")
+    }
+
     /// Storage bindings after the uniform one.
     pub fn bindings(self) -> usize {
         match self {

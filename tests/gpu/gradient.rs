@@ -118,6 +118,16 @@ fn every_type_fill_and_channel_holds_the_tolerance() {
 }
 
 #[test]
+fn threads_go_on_where_there_are_more_voxels_than_threads() {
+    let Some(gpu) = adapter() else { return };
+    let (shape, fit) = ([104; 3], fit(3, GradientWeight::Distance, [1.0; 3]));
+    let case = Case { wanted: [true, false], ..whole(fit, shape) };
+    assert!(case.dst.iter().product::<usize>() > 1 << 20, "workgroups of 64, at most 2^14 of them");
+    let volume = floats(shape, |i| hash(5, i as u64) as f64 / u64::MAX as f64);
+    check(&gpu, "noise", &volume, shape, &case);
+}
+
+#[test]
 fn floats_far_from_one_and_small_changes_of_large_values() {
     let Some(gpu) = adapter() else { return };
     let shape = [7, 9, 33];
