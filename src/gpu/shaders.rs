@@ -80,6 +80,7 @@ impl Shader {
                     "window_kept",
                     "window_tiles",
                     "window_herk_rows",
+                    "window_herk_spans",
                     "window_extremes"
                 )
             }
@@ -114,6 +115,7 @@ impl Shader {
                     "window_kept",
                     "window_tiles",
                     "window_herk_rows",
+                    "window_herk_spans",
                     "window_order"
                 )
             }
@@ -172,9 +174,8 @@ impl Shader {
             Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
             Shader::Copy => &["copy"],
-            Shader::Extremes | Shader::Sums32 | Shader::Sums64 | Shader::Order | Shader::Moments => {
-                &["first", "next", "rows"]
-            }
+            Shader::Extremes | Shader::Order => &["first", "next", "rows", "spans"],
+            Shader::Sums32 | Shader::Sums64 | Shader::Moments => &["first", "next", "rows"],
             _ => &["first", "next"],
         }
     }
