@@ -60,15 +60,14 @@ const NOT_SWEPT: u32 = 0xffffffffu;
 // Steps of a voxel without a greater code ahead: more than there are planes.
 const NONE: u32 = 0xffffu;
 
-// Links of the chain that a thread has at hand, and the end under them.
+// Links of the chain that a thread has at hand, less one.
 const KEPT: u32 = 16u;
 
 var<private> p: Lines;
 // Of each thread a ring of codes and planes, every 64 entries one, each greater than the one above it; under the lowest an end.
 var<workgroup> stack: array<Entry, KEPT * 64u>;
-// Where the thread's highest one stands, and the end, both modulo the ring.
+// Where the thread's highest one stands.
 var<private> highest: u32;
-var<private> end: u32;
 
 fn code(plane: u32, at: vec2<i32>) -> u32 {
     let index = p.code_at + plane * p.code_a + u32(at.x) * p.code_b + u32(at.y) * p.code_c;
@@ -85,34 +84,35 @@ fn shift(plane: u32) -> vec2<i32> {
 fn move_by(at: vec2<i32>, by: vec2<i32>) -> vec3<i32> {
     let size = vec2<i32>(i32(p.size_b), i32(p.size_c));
     let moved = at + by;
-    // One step at most: below 0 or at the size. As unsigned numbers both are too large.
-    let outside = vec2<u32>(moved) >= vec2<u32>(size);
-    let back = select(vec2<i32>(0), size - 1, moved < vec2<i32>(0));
-    return vec3<i32>(select(moved, back, outside), select(0, 1, any(outside)));
+    let inside = all(moved >= vec2<i32>(0)) && all(moved < size);
+    let low = select(vec2<i32>(0), size, moved < vec2<i32>(0));
+    let high = select(vec2<i32>(0), size, moved >= size);
+    return vec3<i32>(moved + low - high, select(1, 0, inside));
 }
 
 fn place_of(plane: u32, thread: u32) -> u32 {
     return p.links + plane * p.threads + thread;
 }
 
-fn slot_of(place: u32) -> u32 {
-    return place % (KEPT * 64u);
-}
-
 // Empties the stack.
 fn forget() {
-    end = highest;
-    stack[slot_of(end)] = entry_of(TOP, NONE);
+    stack[highest] = entry_of(TOP, NONE);
 }
 
-// A voxel onto the stack, which forgets its lowest when it is full.
-fn push(plane: u32, own: u32) {
-    highest += 64u;
-    stack[slot_of(highest)] = entry_of(own, plane);
-    if highest - end == KEPT * 64u {
-        end += 64u;
-        stack[slot_of(end)] = entry_of(TOP, NONE);
-    }
+fn below_of(slot: u32) -> u32 {
+    return (slot - 64u) % (KEPT * 64u);
+}
+
+fn above_of(slot: u32) -> u32 {
+    return (slot + 64u) % (KEPT * 64u);
+}
+
+// A voxel with its answer, and onto the stack, which forgets its lowest when it is full.
+fn leave(plane: u32, thread: u32, own: u32, step: u32) {
+    links[place_of(plane, thread)] = entry_of(own, step);
+    highest = above_of(highest);
+    stack[highest] = entry_of(own, plane);
+    stack[above_of(highest)] = entry_of(TOP, NONE);
 }
 
 // Steps from `plane` to the first greater code than `own`, no more than `room` planes away; `NONE` if there is none. What is
@@ -124,11 +124,11 @@ fn seek(plane: u32, own: u32, room: u32, thread: u32, way: i32) -> u32 {
     }
     let below = entry_of(own, NONE);
     var last = NONE; // plane of the lowest that was not greater
-    var entry = stack[slot_of(highest)];
-    while !is_beyond(entry, below) {
+    var entry = stack[highest];
+    for (var k = 0u; k < KEPT && !is_beyond(entry, below); k += 1u) {
         last = step_of(entry);
-        highest -= 64u;
-        entry = stack[slot_of(highest)];
+        highest = below_of(highest);
+        entry = stack[highest];
     }
     if step_of(entry) != NONE {
         let d = u32(way * (i32(step_of(entry)) - i32(plane)));
@@ -154,10 +154,9 @@ fn contribution(table: u32, d: u32) -> u32 {
 }
 
 fn add_up(plane: u32, at: vec2<i32>, sum: u32) {
-    // What lies before the box is too large as an unsigned number, too.
-    let out = vec3<u32>(vec3<i32>(i32(plane) - p.at_a, at.x - p.at_b, at.y - p.at_c));
-    if all(out < vec3<u32>(p.out_a, p.out_b, p.out_c)) {
-        atomicAdd(&sums[out.x * p.sum_a + out.y * p.sum_b + out.z * p.sum_c], sum);
+    let out = vec3<i32>(i32(plane) - p.at_a, at.x - p.at_b, at.y - p.at_c);
+    if all(out >= vec3<i32>(0)) && all(out < vec3<i32>(i32(p.out_a), i32(p.out_b), i32(p.out_c))) {
+        atomicAdd(&sums[u32(out.x) * p.sum_a + u32(out.y) * p.sum_b + u32(out.z) * p.sum_c], sum);
     }
 }
 
@@ -178,8 +177,7 @@ fn go(start: vec2<i32>, thread: u32) -> vec2<i32> {
         if p.backward != NOT_SWEPT {
             d = seek(i, own, min(room, p.reach), thread, -1);
         }
-        links[place_of(i, thread)] = entry_of(own, d);
-        push(i, own);
+        leave(i, thread, own, d);
         room += 1u;
         if next.z == 1 {
             room = 0u;
@@ -192,8 +190,8 @@ fn go(start: vec2<i32>, thread: u32) -> vec2<i32> {
 }
 
 // And back, seeking forward and adding up both.
-fn come(last: vec2<i32>, thread: u32) {
-    var at = last;
+fn come(end: vec2<i32>, thread: u32) {
+    var at = end;
     var here = links[place_of(p.planes - 1u, thread)];
     var room = 0u;
     for (var k = p.planes; k > 0u; k -= 1u) {
@@ -211,8 +209,7 @@ fn come(last: vec2<i32>, thread: u32) {
         }
         if p.forward != NOT_SWEPT {
             let d = seek(i, own, min(room, p.reach), thread, 1);
-            links[place_of(i, thread)] = entry_of(own, d);
-            push(i, own);
+            leave(i, thread, own, d);
             sum += contribution(p.forward, d);
         }
         add_up(i, at, sum);
@@ -240,10 +237,9 @@ fn sweep(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) group
         return;
     }
     let line = p.first + thread;
-    // High enough for all that leaves the stack.
-    highest = 0x40000000u + local;
+    highest = local;
     forget();
-    let last = go(vec2<i32>(i32(line / p.size_c), i32(line % p.size_c)), thread);
+    let end = go(vec2<i32>(i32(line / p.size_c), i32(line % p.size_c)), thread);
     forget();
-    come(last, thread);
+    come(end, thread);
 }

@@ -5,8 +5,6 @@
 // written: pairs. Workgroup: window_pass.wgsl.
 
 const COLUMNS: u32 = 16u;
-const HELD: u32 = 32u;
-const CELLS: u32 = 4096u;
 
 alias Seen = u32;
 

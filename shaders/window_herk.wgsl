@@ -1,14 +1,10 @@
 // Van Herk over the windows along one axis: blocks as long as the window, so the work per output does not depend on the
 // radius. Every output joins what its block holds from it to the end with what the next block holds up to the window's end.
 // A shader adds the type `Seen`, `nothing`, `join` (first what lies before), `seen_at` (an input), `kept` and `keep` (an
-// output), and `HELD`: windows of at most as many voxels wait for their second part in workgroup memory. Blocks start `phase` outputs before output 0: where joining rounds, they start at multiples of the window in the
+// output). Blocks start `phase` outputs before output 0: where joining rounds, they start at multiples of the window in the
 // volume, and bricks do not show.
 
-// Of each thread what its block holds from each voxel on.
-var<workgroup> held: array<Seen, HELD * 64u>;
-
 fn walk(line: Line, packed: bool) {
-    let hold = p.window <= HELD;
     // q counts voxels from the start of window 0: output k sees q in k .. k + w, of which begin .. end exist.
     let w = i32(p.window);
     let begin = max(-p.first, 0);
@@ -21,18 +17,13 @@ fn walk(line: Line, packed: bool) {
         if q >= begin {
             seen = join(seen_at(line.input + u32(q + p.first) * p.in_axis, packed), seen);
         }
-        if hold {
-            held[u32(q - start) * 64u + line.local] = seen;
-        } else if q < m {
+        if q < m {
             keep(line.output + u32(q) * p.out_axis, seen);
         }
     }
     // ... and from the next block's start to the window's end.
     seen = nothing();
     let last = min(start + w, m);
-    if hold && start >= 0 && start < m {
-        keep(line.output + u32(start) * p.out_axis, held[line.local]);
-    }
     for (var k = start + 1; k < last; k += 1) {
         let q = k + w - 1;
         if q >= begin && q < end {
@@ -40,11 +31,7 @@ fn walk(line: Line, packed: bool) {
         }
         if k >= 0 {
             let place = line.output + u32(k) * p.out_axis;
-            if hold {
-                keep(place, join(held[u32(k - start) * 64u + line.local], seen));
-            } else {
-                keep(place, join(kept(place), seen));
-            }
+            keep(place, join(kept(place), seen));
         }
     }
 }

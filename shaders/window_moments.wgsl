@@ -8,7 +8,6 @@
 // cells of `cell` words: voxels, mean (high, low), and where `square` is 1 M2 (high, low). Workgroup: window_pass.wgsl.
 
 const COLUMNS: u32 = 4u;
-const HELD: u32 = 12u;
 
 struct Seen {
     n: u32,

@@ -6,8 +6,6 @@
 // written: pairs, least and greatest. Workgroup: window_pass.wgsl.
 
 const COLUMNS: u32 = 8u;
-const HELD: u32 = 32u;
-const CELLS: u32 = 2048u;
 
 alias Seen = vec2<u32>;
 

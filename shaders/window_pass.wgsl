@@ -25,10 +25,10 @@ struct Pass {
     phase: u32,     // outputs of block 0 that lie before output 0 (floats)
     zero: u32,      // 0, which no compiler knows
     cell: u32,      // words of a cell of moments
-    rows: u32,      // along x by spans: rows of a workgroup, a multiple of 4, and blocks of a span
-    many: u32,
     spare_0: u32,
     spare_1: u32,
+    spare_2: u32,
+    spare_3: u32,
 }
 
 @group(0) @binding(0) var<uniform> p: Pass;
@@ -38,14 +38,13 @@ struct Line {
     input: u32,
     output: u32,
     block: i32,
-    local: u32, // the thread's number in its workgroup
 }
 
 fn line_of(thread: u32) -> Line {
     let i = thread % p.lines;
     let b = (thread / p.lines) % p.blocks;
     let j = thread / (p.lines * p.blocks);
-    return Line(i * p.in_i + j * p.in_j, i * p.out_i + j * p.out_j, i32(b), thread % 64u);
+    return Line(i * p.in_i + j * p.in_j, i * p.out_i + j * p.out_j, i32(b));
 }
 
 fn one(thread: u32, first_pass: bool) {

@@ -32,25 +32,8 @@ pub struct Pass {
     pub phase: u32,
     pub zero: u32,
     pub cell: u32,
-    pub rows: u32,
-    pub many: u32,
-    pub spare: [u32; 2],
+    pub spare: [u32; 4],
 }
-
-/// Rows, blocks and bytes of a workgroup that takes windows along x by spans, whose cells are of so many bytes; `None` where windows
-/// are too long, so that few threads would have a block.
-fn spans(window: u32, m: u32, cell: u32) -> Option<[u32; 2]> {
-    let all = m.div_ceil(window);
-    // Spans of a row alike.
-    let many = all.div_ceil(all.div_ceil(8));
-    let block = many * window;
-    let cells = (block + window) + block;
-    let rows = (GROUP / many).min(SPAN_BYTES / cell / cells) / 4 * 4;
-    (8 * rows * many >= 3 * GROUP).then_some([rows, many])
-}
-
-/// What every adapter has of workgroup memory; the shaders' `CELLS`.
-const SPAN_BYTES: u32 = 16384;
 
 /// Outputs along x that a workgroup makes of a row, or as many whole blocks as they hold: what it reads beyond them is a sixth of
 /// them at radius 10.
@@ -252,19 +235,7 @@ impl Job {
         };
         let shared = |p: Pass, threads: u32| Pass { threads, square: square as u32, cell: words as u32, ..p };
         let each = |p: Pass, lines: u32| shared(p, p.blocks * p.lines * lines);
-        let short = match quantity {
-            Quantity::Extremes | Quantity::Order => spans(x.window, mx + x.phase, quantity.bytes() as u32),
-            _ => None,
-        };
-        let x = match short {
-            Some([rows, many]) => {
-                let block = many * x.window;
-                Pass { rows, many, block, blocks: (mx + x.phase).div_ceil(block), ..x }
-            }
-            None => x,
-        };
-        let rows = if x.rows > 0 { x.rows } else { GROUP };
-        [each(z, ny), each(y, mz), shared(x, x.blocks * x.lines.div_ceil(rows) * GROUP)]
+        [each(z, ny), each(y, mz), shared(x, x.blocks * x.lines.div_ceil(GROUP) * GROUP)]
     }
 
     /// Every quantity of a part, then what comes back, one quantity after the other; or what the device makes of all of
@@ -315,8 +286,7 @@ impl Job {
             let [a, b, last] = [a, b, last].map(Bind::from);
             for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
                 let bind = [[from, a], [a, b], [b, last]][axis];
-                let entry = if pass.rows > 0 { 3 } else { axis };
-                to.dispatch(shader, entry, &pass, &bind, pass.threads);
+                to.dispatch(shader, axis, &pass, &bind, pass.threads);
             }
             to.give(a.buffer);
             to.give(b.buffer);

@@ -80,7 +80,6 @@ impl Shader {
                     "window_kept",
                     "window_tiles",
                     "window_herk_rows",
-                    "window_herk_spans",
                     "window_extremes"
                 )
             }
@@ -115,7 +114,6 @@ impl Shader {
                     "window_kept",
                     "window_tiles",
                     "window_herk_rows",
-                    "window_herk_spans",
                     "window_order"
                 )
             }
@@ -174,8 +172,9 @@ impl Shader {
             Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
             Shader::Copy => &["copy"],
-            Shader::Extremes | Shader::Order => &["first", "next", "rows", "spans"],
-            Shader::Sums32 | Shader::Sums64 | Shader::Moments => &["first", "next", "rows"],
+            Shader::Extremes | Shader::Sums32 | Shader::Sums64 | Shader::Order | Shader::Moments => {
+                &["first", "next", "rows"]
+            }
             _ => &["first", "next"],
         }
     }
