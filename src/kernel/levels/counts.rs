@@ -2,9 +2,12 @@
 
 use std::ops::Range;
 
-use super::sums::{NEVER, RUN, Row, Sum, Windows};
+use super::sums::{NEVER, Row, Sum, Windows};
 use crate::kernel::simd::Level;
 use crate::multiversion;
+
+/// Most voxels of a row of a tile of [`levels`](super::levels).
+pub(super) const RUN: usize = 128;
 
 /// What counts the voxels of a window.
 #[derive(Clone, Copy, PartialEq, Eq)]

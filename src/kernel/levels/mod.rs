@@ -4,8 +4,9 @@
 mod choose;
 mod codes;
 mod counts;
+mod moves;
 pub mod reference;
-mod search;
+pub(crate) mod search;
 mod slopes;
 pub(crate) mod sums;
 mod vector;
@@ -23,9 +24,9 @@ use crate::grid::{AnyView, AnyViewMut, DType, Shape, View, Voxel};
 use crate::stage::{Ties, WindowParams};
 use crate::{with_dtype, with_view};
 use codes::{Seen, Stored, fill_codes, gone};
-use counts::{All, Counts, Lanes, count_row};
+use counts::{All, Counts, Lanes, RUN, count_row};
 use slopes::{Slopes, interpolate};
-use sums::{NEVER, RUN, Sum, Tile, Windows, Work, sweep};
+use sums::{Asked, NEVER, Sum, Tile, Windows, Work, sweep};
 
 /// Most levels of a volume.
 pub const MOST_LEVELS: usize = 64;
@@ -159,11 +160,19 @@ impl<T: Coded> Job<'_, T> {
         let mut work = Work::<S>::cut(bytes, tile, L);
         let (mut counts, windows) = (Counts::new(), Windows::of_columns(tile));
         for lanes in Lanes::sweeps(self.rule.stored.levels().len(), self.all, L) {
-            sweep::<S, L>(self.level, self.codes, tile, &lanes.thresholds(), &mut work, |z, y, row| {
-                let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
-                count_row(self.level, self.centres(z, y), row, &windows, rows, &lanes, &mut counts);
-                self.emit(z, y, &counts, lanes.part.clone(), lo, dst);
-            });
+            sweep::<S, L>(
+                self.level,
+                self.codes,
+                tile,
+                &lanes.thresholds(),
+                &mut work,
+                |_| Asked::all(tile),
+                |z, y, row| {
+                    let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
+                    count_row(self.level, self.centres(z, y), row, &windows, rows, &lanes, &mut counts);
+                    self.emit(z, y, &counts, lanes.part.clone(), lo, dst);
+                },
+            );
         }
     }
 
