@@ -188,15 +188,17 @@ impl<S: Sum, const L: usize> Row<'_, S, L> {
         self.sums[columns.end][k].minus(self.sums[columns.start][k]).into()
     }
 
-    /// Neighbouring sums from each place (column times L, plus the lane) on. Panics where there are none. Not compiled for
+    /// Four neighbouring sums from each place (column times L, plus the lane) on. Panics where there are none. Not compiled for
     /// vectors, which would gather: plain loads are the faster way.
     #[inline(never)]
-    pub fn pairs<const N: usize>(&self, at: &[u32; N]) -> [[S; 2]; N] {
+    pub fn fours<const N: usize>(&self, at: &[u32; N], to: &mut [[S; 4]; N]) {
         let flat = self.sums.as_flattened();
         let last = at.iter().fold(0, |last, at| last.max(*at)) as usize;
-        assert!(last + 1 < flat.len(), "sums {last} and the next of {}", flat.len());
-        // SAFETY: every place is at most the last, which was checked; an array is aligned as its elements are.
-        std::array::from_fn(|x| unsafe { flat.as_ptr().add(at[x] as usize).cast::<[S; 2]>().read() })
+        assert!(last + 3 < flat.len(), "sums {last} and the next three of {}", flat.len());
+        for (to, at) in to.iter_mut().zip(at) {
+            // SAFETY: every place is at most the last, which was checked; an array is aligned as its elements are.
+            *to = unsafe { flat.as_ptr().add(*at as usize).cast::<[S; 4]>().read() };
+        }
     }
 }
 
