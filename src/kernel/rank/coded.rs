@@ -78,13 +78,13 @@ pub(super) fn scratch_bytes<K: Index>(plan: &Plan) -> usize {
     padded::<u8>(K::KEYS) + padded::<u8>(tile.codes()) + Work::<u32>::bytes(&tile, LANES) + buckets
 }
 
-/// Voxels of a window from which this way is the faster one. 8 bits: at radius 5 (1331 voxels) comparing takes 18.7 ns per
-/// voxel and this 24.7, at radius 10 sliding histograms take 73.6 and this 36.5 (19.8 since one group of thresholds is swept
-/// after the other). 16 bits with many values: at radius 10 (9261 voxels) comparing takes 166 and this 217; at radius 64 this
-/// takes 2.3 us, and comparing, which grows with the window, some 38 us by extrapolation. One insertion of all voxels in the
-/// order of their keys into sums over blocks took 130 ns at radius 10 in a prototype and 5 us at 64 (2-core Zen 4 VM, AVX-512,
-/// 2026-11-26).
-const FROM: [usize; 2] = [1500, 15_000];
+/// Voxels of a window from which this way is the faster one. 8 bits, 256 thresholds: at radius 3 (343 voxels) comparing takes
+/// 8.7 ns per voxel and this 13.4, at radius 4 (729) 12.4 and 13.7, at radius 5 (1331) 18.3 and 14.2, at radius 6 25.2 and 14.3,
+/// at radius 8 48.3 and 15.3. 16 bits with many values: at radius 8 (4913) 92 and 222, at radius 11 (12167) 207 and 265, at
+/// radius 12 (15625) 265 and 207; at radius 64 this takes 2.3 us, and comparing, which grows with the window, some 38 us by
+/// extrapolation. One insertion of all voxels in the order of their keys into sums over blocks took 130 ns at radius 10 in a
+/// prototype and 5 us at 64 (2-core Zen 4 VM, AVX-512, 2026-11-27).
+const FROM: [usize; 2] = [900, 15_000];
 
 /// Whether windows are counted this way: their planes fit in a byte, and there are enough voxels.
 pub(super) fn serves(plan: &Plan, dtype: DType) -> bool {
