@@ -28,32 +28,32 @@ fn main() {
     println!("{:<44} {:>10} {:>10} {:>9}", "kernel", "ns/voxel", "Mvoxel/s", "memcpys");
     for dtype in [DType::U8, DType::U16, DType::F32] {
         let copy = memcpy_ns(dtype);
-        let row = |name: String, mut job: Job| {
+        let row = |name: String, job: &dyn Fn() -> Job<'static>| {
             let name = format!("{name} {dtype}");
             if name.contains(&filter) {
-                report(&name, copy, &mut job);
+                report(&name, copy, &mut job());
             }
         };
         for (window, radius) in
             [(WindowShape::Box, 5), (WindowShape::Box, 10), (WindowShape::Box, 64), (WindowShape::Ball, 5)]
         {
-            row(format!("rank {window:?} radius {radius}"), rank_job(dtype, window, radius));
+            row(format!("rank {window:?} radius {radius}"), &|| rank_job(dtype, window, radius));
         }
         for (count, radius) in [(32, 5), (32, 10), (32, 64), (64, 10)] {
-            row(format!("levels {count} radius {radius}"), levels_job(dtype, count, radius));
+            row(format!("levels {count} radius {radius}"), &|| levels_job(dtype, count, radius));
         }
         for radius in [5, 10, 64] {
-            row(format!("moments4 radius {radius}"), moments4_job(dtype, radius));
+            row(format!("moments4 radius {radius}"), &|| moments4_job(dtype, radius));
         }
         for radius in [10, 64] {
-            row(format!("window cdf_power radius {radius}"), power_job(dtype, radius));
+            row(format!("window cdf_power radius {radius}"), &|| power_job(dtype, radius));
         }
         for moment in ["mean", "variance"] {
-            row(format!("gaussian sigma 3 {moment}"), gaussian_job(dtype, moment == "variance"));
+            row(format!("gaussian sigma 3 {moment}"), &|| gaussian_job(dtype, moment == "variance"));
         }
-        row("occlusion map, base and chain".into(), chain_job(dtype));
+        row("occlusion map, base and chain".into(), &|| chain_job(dtype));
         for size in [3, 5] {
-            row(format!("gradient {size}^3 magnitude"), gradient_job(dtype, size));
+            row(format!("gradient {size}^3 magnitude"), &|| gradient_job(dtype, size));
         }
     }
 }

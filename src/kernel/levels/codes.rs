@@ -141,11 +141,14 @@ pub(super) fn fill_codes<T: Coded>(
     match (found, T::VALUES) {
         (true, _) => {}
         (false, 0) => count_levels(level, row, stored, codes),
-        (false, values) => {
+        (false, values) => match (search::as_bytes(row), table.first_chunk()) {
+            (Some(row), Some(table)) => search::bytes(level, row, table, T::default().place() as u8, codes),
             // Not compiled for vectors, which would gather: plain loads are the faster way.
-            let table = &table[..values];
-            codes.iter_mut().zip(row).for_each(|(code, v)| *code = table[v.place()]);
-        }
+            _ => {
+                let table = &table[..values];
+                codes.iter_mut().zip(row).for_each(|(code, v)| *code = table[v.place()]);
+            }
+        },
     }
     see(level, row, missing, stored.count as u8, codes, seen);
 }

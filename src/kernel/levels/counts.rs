@@ -2,9 +2,12 @@
 
 use std::ops::Range;
 
-use super::sums::{NEVER, RUN, Row, Sum, Windows};
+use super::sums::{NEVER, Row, Sum, Windows};
 use crate::kernel::simd::Level;
 use crate::multiversion;
+
+/// Most voxels of a row of a tile of [`levels`](super::levels).
+pub(super) const RUN: usize = 128;
 
 /// What counts the voxels of a window.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -32,8 +35,9 @@ impl Lanes {
     pub fn sweeps(levels: usize, all: All, lanes: usize) -> impl Iterator<Item = Lanes> {
         let own = lanes - usize::from(all == All::Last);
         let whole = levels <= own;
-        let first = Lanes { levels, first: 0, all, part: (!whole).then_some(0..own) };
-        let more = Lanes { levels, first: own - 1, all, part: Some(own..usize::from(NEVER) + 1) };
+        let first = Lanes { levels, first: 0, all, part: (!whole).then_some(0..own - 1) };
+        // Two levels about each interval of the second part, which starts where the first one has no level after the next.
+        let more = Lanes { levels, first: own - 3, all, part: Some(own - 1..usize::from(NEVER) + 1) };
         [Some(first), (!whole).then_some(more)].into_iter().flatten()
     }
 
@@ -52,13 +56,17 @@ pub(super) struct Counts {
     /// Those not above the level before the centre, and not above the next one.
     pub low: [u32; RUN],
     pub high: [u32; RUN],
+    /// Those in the interval between levels before the centre's, and in the one after it.
+    pub before: [u32; RUN],
+    pub after: [u32; RUN],
     /// Some window lies between two levels as a whole.
     pub narrow: bool,
 }
 
 impl Counts {
     pub fn new() -> Counts {
-        Counts { n: [1; RUN], low: [0; RUN], high: [0; RUN], narrow: false }
+        let none = [0; RUN];
+        Counts { n: [1; RUN], low: none, high: none, before: none, after: none, narrow: false }
     }
 }
 
@@ -76,7 +84,9 @@ pub(super) fn count_row<S: Sum, const L: usize>(
     codes[..centres.len()].copy_from_slice(centres);
     let (mut ends, mut starts) = ([0; RUN], [0; RUN]);
     places(level, &codes, windows, [L as u32, lanes.first as u32], &mut ends, &mut starts);
-    let (ends, starts) = (row.pairs(&ends), row.pairs(&starts));
+    let [mut ends_of, mut starts_of] = [[[S::default(); 4]; RUN]; 2];
+    row.fours(&ends, &mut ends_of);
+    row.fours(&starts, &mut starts_of);
     let all = match lanes.all {
         All::Inside => None,
         All::Top => Some(lanes.levels.saturating_sub(1).wrapping_sub(lanes.first) % L),
@@ -89,13 +99,13 @@ pub(super) fn count_row<S: Sum, const L: usize>(
             sizes.for_each(|(x, n)| *n = row.count(&windows.of(x), lane));
         }
     }
-    finish(level, &codes, &ends, &starts, [lanes.levels as u32, (lanes.first + L) as u32], counts);
+    finish(level, &codes, &ends_of, &starts_of, [lanes.levels as u32, lanes.first as u32, L as u32], counts);
     counts.narrow = narrow(level, centres.len(), counts);
 }
 
 multiversion! {
-    /// Where the sums of each voxel lie, at the end of its window and at its start: lanes of the level before and of the next one
-    /// are neighbours, and are read as a pair.
+    /// Where the sums of each voxel lie, at the end of its window and at its start: lanes of the two levels before and of the two
+    /// that follow are neighbours, and are read at once.
     fn places[](
         codes: &[u8; RUN], windows: &Windows, lanes: [u32; 2], ends: &mut [u32; RUN], starts: &mut [u32; RUN],
     ) -> () = places_inner;
@@ -110,7 +120,7 @@ fn places_inner(
     starts: &mut [u32; RUN],
 ) {
     for x in 0..RUN {
-        let lane = (u32::from(codes[x].max(1)) - 1).wrapping_sub(first).min(lanes - 2);
+        let lane = u32::from(codes[x]).saturating_sub(first + 2).min(lanes - 4);
         ends[x] = windows.end[x] * lanes + lane;
         starts[x] = windows.start[x] * lanes + lane;
     }
@@ -128,29 +138,38 @@ fn extents_inner(windows: &Windows, rows: u32, n: &mut [u32; RUN]) {
 }
 
 multiversion! {
-    /// Counts from the sums of both lanes at both places. Codes from `levels` on lie above all, and `beyond` is the one whose first
-    /// lane is the last.
+    /// Counts from the sums of four lanes at both places. Codes from `levels` on lie above all; lanes start at level `first`.
     fn finish[S: Sum](
-        codes: &[u8; RUN], ends: &[[S; 2]; RUN], starts: &[[S; 2]; RUN], bounds: [u32; 2], counts: &mut Counts,
+        codes: &[u8; RUN], ends: &[[S; 4]; RUN], starts: &[[S; 4]; RUN], bounds: [u32; 3], counts: &mut Counts,
     ) -> () = finish_inner;
 }
 
 #[inline(always)]
 fn finish_inner<S: Sum>(
     codes: &[u8; RUN],
-    ends: &[[S; 2]; RUN],
-    starts: &[[S; 2]; RUN],
-    [levels, beyond]: [u32; 2],
+    ends: &[[S; 4]; RUN],
+    starts: &[[S; 4]; RUN],
+    [levels, first, lanes]: [u32; 3],
     counts: &mut Counts,
 ) {
     for x in 0..RUN {
-        let code = u32::from(codes[x]);
-        let one: u32 = ends[x][0].minus(starts[x][0]).into();
-        let two: u32 = ends[x][1].minus(starts[x][1]).into();
-        let low = if code == beyond { two } else { one };
-        counts.low[x] = if code == 0 { 0 } else { low };
-        let high = if code == 0 { one } else { two };
-        counts.high[x] = if code >= levels { counts.n[x] } else { high };
+        let (code, n) = (u32::from(codes[x]), counts.n[x]);
+        let [a, b, c, d] = std::array::from_fn(|i| -> u32 { ends[x][i].minus(starts[x][i]).into() });
+        // Read were the two levels before the centre and the two that follow, or the nearest four: no voxel lies below the
+        // first level, ...
+        let (one, two) = (code < first + 2, code < first + 1);
+        let [a, b, c, d] = if one { [0, a, b, c] } else { [a, b, c, d] };
+        let [a, b, c, d] = if two { [0, a, b, c] } else { [a, b, c, d] };
+        // ... and all of them below what follows the last lane.
+        let (one, two) = (code > first + lanes - 2, code > first + lanes - 1);
+        let [a, b, c, d] = if one { [b, c, d, n] } else { [a, b, c, d] };
+        let [a, b, c, d] = if two { [b, c, d, n] } else { [a, b, c, d] };
+        let c = if code >= levels { n } else { c };
+        let d = if code + 1 >= levels { n } else { d };
+        counts.low[x] = b;
+        counts.high[x] = c;
+        counts.before[x] = b.wrapping_sub(a);
+        counts.after[x] = d.wrapping_sub(c);
     }
 }
 

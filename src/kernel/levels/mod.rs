@@ -1,11 +1,13 @@
 //! Openness from window counts at quantile levels of the whole volume (local histograms smoothed by a box; see Kass and
-//! Solomon 2010), interpolated between levels about as the volume's own distribution rises. Counts are exact integers, levels are the same for every brick.
+//! Solomon 2010), interpolated between levels about as the volume's own
+//! distribution rises, leaning to the side where the window has more voxels. Counts are exact integers, levels are the same for every brick.
 
 mod choose;
 mod codes;
 mod counts;
+mod moves;
 pub mod reference;
-mod search;
+pub(crate) mod search;
 mod slopes;
 pub(crate) mod sums;
 mod vector;
@@ -24,8 +26,8 @@ use crate::stage::{Ties, WindowParams};
 use crate::{with_dtype, with_view};
 use codes::{Seen, Stored, fill_codes, gone};
 use counts::{All, Counts, Lanes, count_row};
-use slopes::{Slopes, interpolate};
-use sums::{NEVER, RUN, Sum, Tile, Windows, Work, sweep};
+use slopes::{Line, Slopes, interpolate};
+use sums::{Asked, NEVER, Sum, Tile, Windows, Work, sweep};
 
 /// Most levels of a volume.
 pub const MOST_LEVELS: usize = 64;
@@ -35,7 +37,8 @@ pub const MOST_LEVELS: usize = 64;
 const TILE: Shape = [128, 96, 128];
 
 /// Writes the openness of the box that starts at voxel `at` of `src`, with F(v) = share of the window's voxels not above
-/// v: exact at levels, and between them rising much as the whole volume's does. `ties = "mid"`: mean of F(v) and of F below v,
+/// v: exact at levels, and between them rising much as the whole volume's does, more steeply to the side of the neighbouring
+/// interval that has more of the window's voxels. `ties = "mid"`: mean of F(v) and of F below v,
 /// which for integers is F(v - 1). Within 4e-7 of that where the result is f32. A window of equal values gives 1 (0.5), a voxel at +inf 1, at -inf 0, a missing one NaN. `dst` has
 /// `src.dtype().result()`. Panics if extents or types disagree.
 pub fn levels(
@@ -143,6 +146,9 @@ fn one_tile<T: Coded>(
     }
 }
 
+/// Rows in either float.
+type Lines = (Line<f32>, Line<f64>);
+
 /// One tile.
 struct Job<'a, T: Coded> {
     level: Level,
@@ -157,13 +163,21 @@ impl<T: Coded> Job<'_, T> {
     fn run<S: Sum, const L: usize>(&self, bytes: &mut [u8], lo: [usize; 3], dst: &mut AnyViewMut) {
         let tile = self.tile;
         let mut work = Work::<S>::cut(bytes, tile, L);
-        let (mut counts, windows) = (Counts::new(), Windows::of_columns(tile));
+        let (mut counts, mut rows, windows) = (Counts::new(), (Line::new(), Line::new()), Windows::of_columns(tile));
         for lanes in Lanes::sweeps(self.rule.stored.levels().len(), self.all, L) {
-            sweep::<S, L>(self.level, self.codes, tile, &lanes.thresholds(), &mut work, |z, y, row| {
-                let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
-                count_row(self.level, self.centres(z, y), row, &windows, rows, &lanes, &mut counts);
-                self.emit(z, y, &counts, lanes.part.clone(), lo, dst);
-            });
+            sweep::<S, L>(
+                self.level,
+                self.codes,
+                tile,
+                &lanes.thresholds(),
+                &mut work,
+                |_| Asked::all(tile),
+                |z, y, row| {
+                    let height = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
+                    count_row(self.level, self.centres(z, y), row, &windows, height, &lanes, &mut counts);
+                    self.emit(z, y, &counts, &mut rows, lanes.part.clone(), lo, dst);
+                },
+            );
         }
     }
 
@@ -179,11 +193,13 @@ impl<T: Coded> Job<'_, T> {
     }
 
     /// Openness of a row from its counts, where its codes are of the part given.
+    #[allow(clippy::too_many_arguments)]
     fn emit(
         &self,
         z: usize,
         y: usize,
         counts: &Counts,
+        lines: &mut Lines,
         part: Option<Range<usize>>,
         lo: [usize; 3],
         dst: &mut AnyViewMut,
@@ -192,16 +208,14 @@ impl<T: Coded> Job<'_, T> {
         let place = [lo[0] + z, lo[1] + y, lo[2]];
         match &self.rule.slopes {
             Either::F32(slopes) => {
-                let mut open = [0.0; RUN];
-                interpolate(self.level, values, codes, slopes, ties, counts, &mut open);
-                self.special([z, y], counts, &mut open[..values.len()]);
-                write(&open, codes, part, place, dst);
+                interpolate(self.level, values, codes, slopes, ties, counts, &mut lines.0);
+                self.special([z, y], counts, &mut lines.0.open[..values.len()]);
+                write(&lines.0.open, codes, part, place, dst);
             }
             Either::F64(slopes) => {
-                let mut open = [0.0; RUN];
-                interpolate(self.level, values, codes, slopes, ties, counts, &mut open);
-                self.special([z, y], counts, &mut open[..values.len()]);
-                write(&open, codes, part, place, dst);
+                interpolate(self.level, values, codes, slopes, ties, counts, &mut lines.1);
+                self.special([z, y], counts, &mut lines.1.open[..values.len()]);
+                write(&lines.1.open, codes, part, place, dst);
             }
         }
     }
@@ -254,22 +268,26 @@ impl<T: Coded> Job<'_, T> {
     fn planes_beyond_bytes(&self, lo: [usize; 3], dst: &mut AnyViewMut) {
         let tile = self.tile;
         let (mut counts, gaps) = (Counts { narrow: true, ..Counts::new() }, self.all != All::Inside);
+        let mut rows = (Line::new(), Line::new());
         for (z, y) in (0..tile.dst[0]).flat_map(|z| (0..tile.dst[1]).map(move |y| (z, y))) {
             let centres = self.centres(z, y);
             for (x, centre) in centres.iter().enumerate() {
                 let columns = tile.window(2, x);
-                let (mut n, mut low, mut high) = (0, 0, 0);
+                let (mut n, mut low, mut high, mut before, mut after) = (0, 0, 0, 0, 0);
                 for (z, y) in tile.window(0, z).flat_map(|z| tile.window(1, y).map(move |y| (z, y))) {
                     let row = &self.codes[(z * tile.src[1] + y) * tile.src[2]..][..tile.src[2]];
                     for code in &row[columns.clone()] {
                         n += u32::from(!gaps || *code != NEVER);
                         low += u32::from(code < centre);
                         high += u32::from(code <= centre && (!gaps || *code != NEVER));
+                        before += u32::from(u32::from(*code) + 1 == u32::from(*centre));
+                        after += u32::from(u32::from(*code) == u32::from(*centre) + 1);
                     }
                 }
                 (counts.n[x], counts.low[x], counts.high[x]) = (n, low, high);
+                (counts.before[x], counts.after[x]) = (before, after);
             }
-            self.emit(z, y, &counts, None, lo, dst);
+            self.emit(z, y, &counts, &mut rows, None, lo, dst);
         }
     }
 }

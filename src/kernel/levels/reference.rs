@@ -35,12 +35,16 @@ pub fn voxel<T: Voxel>(src: View<T>, c: [usize; 3], levels: &Levels, params: &Wi
         return if ties == Ties::Le { after / n } else { (before + after) / (2.0 * n) };
     }
     let (from, to) = (levels.at[k - 1], levels.at[k]);
+    // The density rises or falls within the interval as it does around it.
+    let twice_before = if k < 2 { 0.0 } else { at_most(levels.at[k - 2]) };
+    let twice_after = levels.at.get(k + 1).map_or(n, |t| at_most(*t));
+    let lean = ((twice_after - after) - (before - twice_before)) / (twice_after - twice_before).max(1.0);
     let rise = |parts: usize| if parts == 0 { 0.0 } else { levels.rise[k][parts - 1] };
     let slope = |u: f64| {
         let way = ((u - from) / (to - from)).max(0.0) * PARTS as f64;
         let parts = (way.floor() as usize).min(PARTS - 1);
         let risen = rise(parts) + (rise(parts + 1) - rise(parts)) * (way - parts as f64);
-        (before + (after - before) * risen) / n
+        (before + (after - before) * (risen - lean * risen * (1.0 - risen))) / n
     };
     let below = if T::DTYPE.is_float() { v } else { v - 1.0 };
     if ties == Ties::Le { slope(v) } else { (slope(v) + slope(below)) / 2.0 }

@@ -3,6 +3,7 @@
 //! 2026-11-26).
 
 use super::MOST_LEVELS;
+use crate::grid::Voxel;
 use crate::kernel::simd::Level;
 
 /// Writes how many of `levels` lie below each voxel of a row, in the order that `flipped` turns around; rubbish for NaN. Levels
@@ -49,11 +50,48 @@ pub(super) fn words(level: Level, row: &[u16], levels: &[u16], turn: u16, codes:
     false
 }
 
+/// Writes `table[v ^ turn]` for each byte of a row: with u8 at radius 10, plain loads take 1 ns per output voxel of exact counts,
+/// and this 0.1 (2-core Zen 4 VM, AVX-512, 2026-11-26).
+pub(crate) fn bytes(level: Level, row: &[u8], table: &[u8; 256], turn: u8, codes: &mut [u8]) {
+    #[cfg(target_arch = "x86_64")]
+    if level == Level::Avx512 {
+        // SAFETY: the level says that the CPU has AVX-512.
+        return unsafe { x86::bytes(row, table, turn, codes) };
+    }
+    let _ = level;
+    codes.iter_mut().zip(row).for_each(|(code, v)| *code = table[usize::from(v ^ turn)]);
+}
+
+/// A row of a type of 8 bits as bytes.
+pub(crate) fn as_bytes<T: Voxel>(row: &[T]) -> Option<&[u8]> {
+    // SAFETY: of that size, and voxels are plain numbers.
+    (size_of::<T>() == 1).then(|| unsafe { std::slice::from_raw_parts(row.as_ptr().cast(), row.len()) })
+}
+
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::x86_64::*;
 
     use super::MOST_LEVELS;
+
+    /// # Safety
+    /// The CPU must have AVX-512 with VBMI.
+    #[target_feature(enable = "avx512f,avx512bw,avx512vbmi,bmi2")]
+    pub unsafe fn bytes(row: &[u8], table: &[u8; 256], turn: u8, codes: &mut [u8]) {
+        let turn = _mm512_set1_epi8(turn as i8);
+        // SAFETY: the parts lie in the table; loads and stores are masked to chunks of the row and of the codes.
+        unsafe {
+            let parts: [__m512i; 4] = std::array::from_fn(|i| _mm512_loadu_si512(table.as_ptr().add(64 * i).cast()));
+            for (row, codes) in row.chunks(64).zip(codes.chunks_mut(64)) {
+                let lanes = u64::MAX >> (64 - row.len().min(codes.len()));
+                let v = _mm512_xor_si512(_mm512_maskz_loadu_epi8(lanes, row.as_ptr().cast()), turn);
+                let lower = _mm512_permutex2var_epi8(parts[0], v, parts[1]);
+                let upper = _mm512_permutex2var_epi8(parts[2], v, parts[3]);
+                let found = _mm512_mask_blend_epi8(_mm512_movepi8_mask(v), lower, upper);
+                _mm512_mask_storeu_epi8(codes.as_mut_ptr().cast(), lanes, found);
+            }
+        }
+    }
 
     /// `MORE`: there are more levels than the first half of the table holds.
     ///
@@ -140,6 +178,19 @@ mod tests {
                     let expect = levels.iter().filter(|l| turn(**l) < turn(*v)).count();
                     assert_eq!(usize::from(code), expect, "{v} among {count} levels");
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn looks_every_byte_up() {
+        let table: [u8; 256] = std::array::from_fn(|i| (i * 167 + 13) as u8);
+        let row: Vec<u8> = (0..=255).chain([7, 255, 128, 127, 0]).collect();
+        for level in Level::available() {
+            for turn in [0, 0xff, 0x80, 0x7f] {
+                let mut codes = vec![77; row.len()];
+                bytes(level, &row, &table, turn, &mut codes);
+                assert!(row.iter().zip(&codes).all(|(v, code)| *code == table[usize::from(v ^ turn)]), "{level:?}");
             }
         }
     }

@@ -13,6 +13,7 @@ use crate::grid::{Region, Shape};
 use crate::kernel::simd::Level;
 use crate::multiversion;
 
+use super::moves::{Moves, Steps, shift};
 use super::vector::{self, Rows};
 
 /// Code of a voxel that no threshold counts; with it, at most 255 thresholds.
@@ -87,7 +88,7 @@ impl Tile {
 }
 
 /// Most voxels of a row of a tile whose windows are kept.
-pub(crate) const RUN: usize = 128;
+pub(crate) const RUN: usize = 256;
 
 /// Columns of the windows of a tile's rows.
 pub(crate) struct Windows {
@@ -117,10 +118,12 @@ pub(crate) trait Sum: crate::grid::Voxel + Into<u32> {
     fn plus(self, by: Self) -> Self;
     fn minus(self, by: Self) -> Self;
     fn by(change: i16) -> Self;
+    /// The same, where they are words.
+    fn words(sums: &[Self]) -> Option<&[u16]>;
 }
 
 macro_rules! sum {
-    ($($t:ty),*) => {$(
+    ($($t:ty, $words:expr;)*) => {$(
         impl Sum for $t {
             const MOST: u64 = <$t>::MAX as u64;
             #[inline(always)]
@@ -129,10 +132,15 @@ macro_rules! sum {
             fn minus(self, by: Self) -> Self { self.wrapping_sub(by) }
             #[inline(always)]
             fn by(change: i16) -> Self { change as $t }
+            #[inline(always)]
+            fn words(sums: &[Self]) -> Option<&[u16]> { ($words)(sums) }
         }
     )*};
 }
-sum!(u16, u32);
+sum! {
+    u16, Some;
+    u32, |_| None;
+}
 
 /// Buffers of [`sweep`], cut out of scratch. With 64 lanes the columns of a tile should stay within the L2 cache.
 pub(crate) struct Work<'a, S> {
@@ -140,28 +148,31 @@ pub(crate) struct Work<'a, S> {
     columns: &'a mut [u8],
     /// `[column + 1][lane]`, twice.
     sums: &'a mut [S],
-    /// Changes of the columns of a plane: low ends, lengths, signs.
-    moves: &'a mut [u8],
+    /// Changes of the columns of a plane: steps of the voxels that enter, and of those that leave.
+    moves: &'a mut [u16],
+    /// [`Steps`].
+    steps: &'a mut [u8],
 }
 
 impl<'a, S: Sum> Work<'a, S> {
-    fn lengths(tile: &Tile, lanes: usize) -> [usize; 3] {
+    fn lengths(tile: &Tile, lanes: usize) -> [usize; 4] {
         let [_, rows, width] = tile.src;
-        [(rows + 2) * width * lanes, 2 * (width + 1) * lanes, 3 * rows * width]
+        [(rows + 2) * width * lanes, 2 * (width + 1) * lanes, 2 * rows * width, (lanes + 1) * lanes]
     }
 
     /// Bytes that [`Work::cut`] takes.
     pub fn bytes(tile: &Tile, lanes: usize) -> usize {
-        let [columns, sums, moves] = Self::lengths(tile, lanes);
-        padded::<u8>(columns) + padded::<S>(sums) + padded::<u8>(moves)
+        let [columns, sums, moves, steps] = Self::lengths(tile, lanes);
+        padded::<u8>(columns) + padded::<S>(sums) + padded::<u16>(moves) + padded::<u8>(steps)
     }
 
     pub fn cut(bytes: &'a mut [u8], tile: &Tile, lanes: usize) -> Work<'a, S> {
         let lengths = Self::lengths(tile, lanes);
         let (columns, bytes) = cut::<u8>(bytes, lengths[0]);
         let (sums, bytes) = cut::<S>(bytes, lengths[1]);
-        let (moves, _) = cut::<u8>(bytes, lengths[2]);
-        Work { columns, sums, moves }
+        let (moves, bytes) = cut::<u16>(bytes, lengths[2]);
+        let (steps, _) = cut::<u8>(bytes, lengths[3]);
+        Work { columns, sums, moves, steps }
     }
 }
 
@@ -177,26 +188,42 @@ impl<S: Sum, const L: usize> Row<'_, S, L> {
         self.sums[columns.end][k].minus(self.sums[columns.start][k]).into()
     }
 
-    /// Neighbouring sums from each place (column times L, plus the lane) on. Panics where there are none. Not compiled for
+    /// Four neighbouring sums from each place (column times L, plus the lane) on. Panics where there are none. Not compiled for
     /// vectors, which would gather: plain loads are the faster way.
     #[inline(never)]
-    pub fn pairs(&self, at: &[u32; RUN]) -> [[S; 2]; RUN] {
+    pub fn fours<const N: usize>(&self, at: &[u32; N], to: &mut [[S; 4]; N]) {
         let flat = self.sums.as_flattened();
         let last = at.iter().fold(0, |last, at| last.max(*at)) as usize;
-        assert!(last + 1 < flat.len(), "sums {last} and the next of {}", flat.len());
-        // SAFETY: every place is at most the last, which was checked; an array is aligned as its elements are.
-        std::array::from_fn(|x| unsafe { flat.as_ptr().add(at[x] as usize).cast::<[S; 2]>().read() })
+        assert!(last + 3 < flat.len(), "sums {last} and the next three of {}", flat.len());
+        for (to, at) in to.iter_mut().zip(at) {
+            // SAFETY: every place is at most the last, which was checked; an array is aligned as its elements are.
+            *to = unsafe { flat.as_ptr().add(*at as usize).cast::<[S; 4]>().read() };
+        }
     }
 }
 
-/// Calls `emit(z, y, row)` for every output row, with the counts of L lanes: lane `k` counts codes up to `lanes[k]`. More
-/// thresholds than lanes: one sweep after the other, whose columns stay in the cache.
+/// Output voxels of a plane that are asked for: those of its first rows, in some columns.
+pub(crate) struct Asked {
+    pub rows: usize,
+    pub columns: Range<usize>,
+}
+
+impl Asked {
+    pub fn all(tile: &Tile) -> Asked {
+        Asked { rows: tile.dst[1], columns: 0..tile.dst[2] }
+    }
+}
+
+/// Calls `emit(z, y, row)` for the rows of each plane that are `asked(z)`, with the counts of L lanes: lane `k` counts codes
+/// up to `lanes[k]`, which ascend (see [`Steps`]). More thresholds than lanes: one sweep after the other, whose columns stay
+/// in the cache.
 pub(crate) fn sweep<S: Sum, const L: usize>(
     level: Level,
     codes: &[u8],
     tile: &Tile,
     lanes: &[u8; L],
     work: &mut Work<S>,
+    asked: impl Fn(usize) -> Asked,
     mut emit: impl FnMut(usize, usize, Row<S, L>),
 ) {
     assert!(tile.fits::<S>() && codes.len() == tile.codes());
@@ -212,6 +239,7 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
     zeros.fill([0; L]);
     none.fill([0; L]);
     let thresholds = &vector::in_columns(lanes);
+    let steps = Steps::new(lanes, work.steps.as_chunks_mut::<L>().0);
     let tall = tile.most(0) > i8::MAX as usize;
     let mut planes = 0..0;
     for z in 0..tile.dst[0] {
@@ -223,8 +251,8 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
         let both = leaving.len() == 1 && entering.len() == 1;
         let above = tile.window(1, 0).len() * width;
         let moves = if both {
-            let moves = Moves::between(level, of(entering.start), of(leaving.start), work.moves);
-            first_rows(level, thresholds, &mut columns[..above], moves.cut(0..above), first);
+            let moves = Moves::between(level, &steps, of(entering.start), of(leaving.start), work.moves);
+            first_rows(level, &mut columns[..above], moves.cut(0..above), first);
             Some(moves)
         } else if leaving.is_empty() && entering.is_empty() {
             None
@@ -235,74 +263,43 @@ pub(crate) fn sweep<S: Sum, const L: usize>(
             }
             first.fill([S::default(); L]);
             for into in columns[..above].chunks_exact_mut(width) {
-                step_rows(level, Rows { thresholds, into, out: zeros, moves: None, tall }, first);
+                step_rows(level, Rows { into, out: zeros, moves: None, tall }, first);
             }
             None
         };
-        sums.copy_from_slice(first);
+        let asked = asked(z);
+        // Columns of the windows asked for: sums start anywhere.
+        let (seen, reach) = match asked.columns.is_empty() || asked.rows == 0 {
+            true => (0, 0..0),
+            false => (asked.rows, tile.window(2, asked.columns.start).start..tile.window(2, asked.columns.end - 1).end),
+        };
+        sums[reach.start..=reach.end].copy_from_slice(&first[reach.start..=reach.end]);
+        let row_of = |y: usize| y * width + reach.start..y * width + reach.end;
         let mut band = tile.window(1, 0);
-        for y in 0..tile.dst[1] {
+        for y in 0..seen {
             let now = tile.window(1, y);
             let (leaving, entering) = (band.start..now.start.min(band.end), now.start.max(band.end)..now.end);
             band = now;
             for i in 0..leaving.len().max(entering.len()) {
                 let into = entering.clone().nth(i);
                 let (before, from) = columns.split_at_mut(into.map_or(plane, |y| y * width));
-                let out = leaving.clone().nth(i).map_or(&*zeros, |y| &before[y * width..][..width]);
+                let out = leaving.clone().nth(i).map_or(&zeros[reach.clone()], |y| &before[row_of(y)]);
                 let (into, moves) = match into {
-                    Some(y) => (&mut from[..width], moves.map(|m| m.cut(y * width..(y + 1) * width))),
-                    None => (&mut *none, None),
+                    Some(y) => (&mut from[reach.clone()], moves.map(|m| m.cut(row_of(y)))),
+                    None => (&mut none[reach.clone()], None),
                 };
-                step_rows(level, Rows { thresholds, into, out, moves, tall }, sums);
+                step_rows(level, Rows { into, out, moves, tall }, &mut sums[reach.start..=reach.end]);
             }
             emit(z, y, Row { sums });
         }
-    }
-}
-
-/// How columns change when a voxel of each is replaced: thresholds from `low` on, `length` of them, by `sign`, 1 or -1.
-#[derive(Clone, Copy)]
-pub(super) struct Moves<'a> {
-    pub low: &'a [u8],
-    pub length: &'a [u8],
-    pub sign: &'a [u8],
-}
-
-impl<'a> Moves<'a> {
-    fn between(level: Level, enters: &[u8], leaves: &[u8], bytes: &'a mut [u8]) -> Moves<'a> {
-        let (low, rest) = bytes.split_at_mut(enters.len());
-        let (length, sign) = rest.split_at_mut(enters.len());
-        find_moves(level, enters, leaves, low, length, sign);
-        Moves { low, length, sign }
-    }
-
-    fn cut(&self, columns: Range<usize>) -> Moves<'a> {
-        let [low, length, sign] = [self.low, self.length, self.sign].map(|m| &m[columns.clone()]);
-        Moves { low, length, sign }
-    }
-
-    /// Column `x` moved.
-    #[inline(always)]
-    fn apply<const L: usize>(&self, x: usize, thresholds: &[u8; L], mut column: [u8; L]) -> [u8; L] {
-        let (low, length, sign) = (self.low[x], self.length[x], self.sign[x]);
-        for (c, threshold) in column.iter_mut().zip(thresholds) {
-            let moved = threshold.wrapping_sub(low) < length;
-            *c = c.wrapping_add(if moved { sign } else { 0 });
+        if let Some(moves) = moves {
+            let mut rest = |part: Range<usize>| shift(level, &mut columns[part.clone()], moves.cut(part));
+            for y in tile.window(1, 0).end..band.end {
+                rest(y * width..row_of(y).start);
+                rest(row_of(y).end..(y + 1) * width);
+            }
+            rest(band.end * width..plane);
         }
-        column
-    }
-}
-
-multiversion! {
-    fn find_moves[](enters: &[u8], leaves: &[u8], low: &mut [u8], length: &mut [u8], sign: &mut [u8]) -> () = find_moves_inner;
-}
-
-#[inline(always)]
-fn find_moves_inner(enters: &[u8], leaves: &[u8], low: &mut [u8], length: &mut [u8], sign: &mut [u8]) {
-    for ((((e, l), low), length), sign) in enters.iter().zip(leaves).zip(low).zip(length).zip(sign) {
-        *low = *e.min(l);
-        *length = *e.max(l) - *low;
-        *sign = if e < l { 1 } else { 255 };
     }
 }
 
@@ -349,46 +346,33 @@ fn leave_inner<const L: usize>(thresholds: &[u8; L], codes: &[u8], columns: &mut
 }
 
 /// Moves the columns of the first window's rows, and its sums with them.
-fn first_rows<S: Sum, const L: usize>(
-    level: Level,
-    thresholds: &[u8; L],
-    columns: &mut [[u8; L]],
-    moves: Moves,
-    sums: &mut [[S; L]],
-) {
+fn first_rows<S: Sum, const L: usize>(level: Level, columns: &mut [[u8; L]], moves: Moves<L>, sums: &mut [[S; L]]) {
     /// Rows whose changes a signed byte holds.
     const ROWS: usize = 32;
     let part = ROWS * (sums.len() - 1);
     for (i, columns) in columns.chunks_mut(part).enumerate() {
         let moves = moves.cut(i * part..i * part + columns.len());
-        if !vector::first(level, thresholds, columns, moves, sums) {
-            first(level, thresholds, columns, moves, sums);
+        if !vector::first(level, columns, moves, sums) {
+            first(level, columns, moves, sums);
         }
     }
 }
 
 multiversion! {
-    fn first['a, S: Sum, const L: usize](
-        thresholds: &[u8; L], columns: &mut [[u8; L]], moves: Moves<'a>, sums: &mut [[S; L]],
-    ) -> () = first_inner;
+    fn first['a, S: Sum, const L: usize](columns: &mut [[u8; L]], moves: Moves<'a, L>, sums: &mut [[S; L]]) -> () = first_inner;
 }
 
 #[inline(always)]
-fn first_inner<S: Sum, const L: usize>(
-    thresholds: &[u8; L],
-    columns: &mut [[u8; L]],
-    moves: Moves,
-    sums: &mut [[S; L]],
-) {
+fn first_inner<S: Sum, const L: usize>(columns: &mut [[u8; L]], moves: Moves<L>, sums: &mut [[S; L]]) {
     let width = sums.len() - 1;
     let mut carry = [S::default(); L];
     for (x, sum) in sums[1..].iter_mut().enumerate() {
         let mut change = [0u8; L];
         for at in (x..columns.len()).step_by(width) {
-            let before = columns[at];
-            columns[at] = moves.apply(at, thresholds, before);
+            let by = moves.change(at);
             for k in 0..L {
-                change[k] = change[k].wrapping_add(columns[at][k].wrapping_sub(before[k]));
+                columns[at][k] = columns[at][k].wrapping_add(by[k]);
+                change[k] = change[k].wrapping_add(by[k]);
             }
         }
         let change = widen(&change, true);
@@ -422,7 +406,7 @@ fn step_inner<S: Sum, const L: usize>(rows: Rows<L>, sums: &mut [[S; L]]) {
     let mut carry = [S::default(); L];
     for (x, ((sum, into), out)) in sums[1..].iter_mut().zip(rows.into).zip(rows.out).enumerate() {
         if let Some(moves) = rows.moves {
-            *into = moves.apply(x, rows.thresholds, *into);
+            *into = moves.apply(x, *into);
         }
         let (into, out) = (widen(into, false), widen(out, false));
         for k in 0..L {

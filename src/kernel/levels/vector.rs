@@ -1,6 +1,7 @@
 //! The inner loop of [`super::sums`] written with intrinsics, beside the portable one that the compiler makes vectors of.
 
-use super::sums::{Moves, Sum};
+use super::moves::Moves;
+use super::sums::Sum;
 use crate::kernel::simd::Level;
 
 /// Thresholds of the lanes in the order of the bytes of a column: those of the first half of the lanes are the even bytes, which
@@ -11,12 +12,10 @@ pub(super) fn in_columns<const L: usize>(lanes: &[u8; L]) -> [u8; L] {
 
 /// One row of columns in, another out; see [`step`].
 pub(super) struct Rows<'a, const L: usize> {
-    /// What each byte of a column counts.
-    pub thresholds: &'a [u8; L],
     pub into: &'a mut [[u8; L]],
     pub out: &'a [[u8; L]],
     /// How the columns of `into` change first.
-    pub moves: Option<Moves<'a>>,
+    pub moves: Option<Moves<'a, L>>,
     /// Columns differ by more than a signed byte holds.
     pub tall: bool,
 }
@@ -28,7 +27,7 @@ pub(super) fn step<S: Sum, const L: usize>(level: Level, rows: &mut Rows<L>, sum
     if level == Level::Avx512 && (L == 32 || L == 64) {
         let width = rows.into.len();
         assert!(rows.out.len() == width && sums.len() == width + 1);
-        assert!(rows.moves.is_none_or(|m| [m.low, m.length, m.sign].iter().all(|m| m.len() == width)));
+        assert!(rows.moves.is_none_or(|m| m.len() == width));
         // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
         unsafe {
             match (L, S::MOST > u64::from(u16::MAX)) {
@@ -47,26 +46,38 @@ pub(super) fn step<S: Sum, const L: usize>(level: Level, rows: &mut Rows<L>, sum
 /// Moves the columns of some rows, and the sums with them. True where there is a vector form.
 pub(super) fn first<S: Sum, const L: usize>(
     level: Level,
-    thresholds: &[u8; L],
     columns: &mut [[u8; L]],
-    moves: Moves,
+    moves: Moves<L>,
     sums: &mut [[S; L]],
 ) -> bool {
     #[cfg(target_arch = "x86_64")]
     if level == Level::Avx512 && (L == 32 || L == 64) {
-        assert!([moves.low, moves.length, moves.sign].iter().all(|m| m.len() == columns.len()));
+        assert!(moves.len() == columns.len());
         // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
         unsafe {
             match (L, S::MOST > u64::from(u16::MAX)) {
-                (32, false) => x86::first_narrow_32(thresholds, columns, moves, sums),
-                (32, true) => x86::first_wide_32(thresholds, columns, moves, sums),
-                (_, false) => x86::first_narrow_64(thresholds, columns, moves, sums),
-                (_, true) => x86::first_wide_64(thresholds, columns, moves, sums),
+                (32, false) => x86::first_narrow_32(columns, moves, sums),
+                (32, true) => x86::first_wide_32(columns, moves, sums),
+                (_, false) => x86::first_narrow_64(columns, moves, sums),
+                (_, true) => x86::first_wide_64(columns, moves, sums),
             }
         }
         return true;
     }
-    let _ = (level, thresholds, columns, moves, sums);
+    let _ = (level, columns, moves, sums);
+    false
+}
+
+/// Moves columns, and nothing else. True where there is a vector form.
+pub(super) fn shift<const L: usize>(level: Level, columns: &mut [[u8; L]], moves: Moves<L>) -> bool {
+    #[cfg(target_arch = "x86_64")]
+    if level == Level::Avx512 && (L == 32 || L == 64) {
+        assert!(moves.len() == columns.len());
+        // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
+        unsafe { if L == 32 { x86::shift_32(columns, moves) } else { x86::shift_64(columns, moves) } }
+        return true;
+    }
+    let _ = (level, columns, moves);
     false
 }
 
@@ -77,22 +88,36 @@ mod x86 {
     use super::{Moves, Rows};
 
     macro_rules! steps {
-        ($($narrow:ident, $wide:ident, $first_narrow:ident, $first_wide:ident, $v:ty, $load:ident, $store:ident, $bytes:ident,
-           $words:ident, $zero:ident, $sub8:ident, $add8:ident, $lt:ident, $masked:ident, $maskz:ident, $pairs:ident,
+        ($($narrow:ident, $wide:ident, $first_narrow:ident, $first_wide:ident, $shift_only:ident, $v:ty, $load:ident, $store:ident,
+           $words:ident, $zero:ident, $sub8:ident, $add8:ident, $pairs:ident,
            $add16:ident, $add32:ident, $and:ident, $shift:ident, $sub16:ident,
            $low:ident, $high:ident;)*) => {$(
-            steps!(@row $narrow, 2, [$load, $store, $bytes, $words, $zero, $sub8, $lt, $masked, $pairs, $and, $shift, $sub16], $v, $add16,
+            steps!(@row $narrow, 2, [$load, $store, $words, $zero, $sub8, $add8, $pairs, $and, $shift, $sub16], $v, $add16,
                 |a, b| [a, b]);
-            steps!(@row $wide, 4, [$load, $store, $bytes, $words, $zero, $sub8, $lt, $masked, $pairs, $and, $shift, $sub16], $v, $add32,
+            steps!(@row $wide, 4, [$load, $store, $words, $zero, $sub8, $add8, $pairs, $and, $shift, $sub16], $v, $add32,
                 |a, b| [$low(a), $high(a), $low(b), $high(b)]);
-            steps!(@first $first_narrow, 2, [$load, $store, $bytes, $words, $zero, $sub8, $add8, $lt, $maskz, $pairs], $v,
+            steps!(@first $first_narrow, 2, [$load, $store, $words, $zero, $sub8, $add8, $pairs], $v,
                 $add16, |a, b| [a, b]);
-            steps!(@first $first_wide, 4, [$load, $store, $bytes, $words, $zero, $sub8, $add8, $lt, $maskz, $pairs], $v,
+            steps!(@first $first_wide, 4, [$load, $store, $words, $zero, $sub8, $add8, $pairs], $v,
                 $add32, |a, b| [$low(a), $high(a), $low(b), $high(b)]);
+            /// # Safety
+            /// As above; as many moves as columns.
+            #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx2")]
+            pub unsafe fn $shift_only<const L: usize>(columns: &mut [[u8; L]], m: Moves<L>) {
+                for (x, column) in columns.iter_mut().enumerate() {
+                    // SAFETY: as the caller promised.
+                    unsafe {
+                        let [enters, leaves] = m.rows(x);
+                        let column = column.as_mut_ptr().cast::<$v>();
+                        let moved = $add8($load(column.cast_const().cast()), $load(enters.cast()));
+                        $store(column.cast(), $sub8(moved, $load(leaves.cast())));
+                    }
+                }
+            }
         )*};
         (@row $name:ident, $parts:literal,
-         [$load:ident, $store:ident, $bytes:ident, $words:ident, $zero:ident, $sub8:ident, $lt:ident, $masked:ident, $pairs:ident,
-          $and:ident, $shift:ident, $sub16:ident],
+         [$load:ident, $store:ident, $words:ident, $zero:ident, $sub8:ident, $add8:ident, $pairs:ident, $and:ident, $shift:ident,
+          $sub16:ident],
          $v:ty, $add:ident, |$a:ident, $b:ident| $widened:expr) => {
             /// # Safety
             /// The CPU must have AVX-512, `L` must be the number of bytes of a vector, the sums of the type in the name, and the
@@ -101,7 +126,6 @@ mod x86 {
             pub unsafe fn $name<S, const L: usize>(rows: &mut Rows<L>, sums: &mut [[S; L]]) {
                 // SAFETY: as the caller promised.
                 unsafe {
-                    let thresholds = $load(rows.thresholds.as_ptr().cast());
                     // Even and odd bytes of signed differences.
                     let (even, odd) = ($words(0x0001), $words(0x0100));
                     let (into, out) = (rows.into.as_mut_ptr(), rows.out.as_ptr());
@@ -110,9 +134,8 @@ mod x86 {
                     for x in 0..rows.into.len() {
                         let mut column = $load(into.add(x).cast());
                         if let Some(m) = rows.moves {
-                            let at = |bytes: &[u8]| $bytes(*bytes.get_unchecked(x) as i8);
-                            let moved = $lt($sub8(thresholds, at(m.low)), at(m.length));
-                            column = $masked(column, moved, column, at(m.sign));
+                            let [enters, leaves] = m.rows(x);
+                            column = $sub8($add8(column, $load(enters.cast())), $load(leaves.cast()));
                             $store(into.add(x).cast(), column);
                         }
                         let leaving = $load(out.add(x).cast());
@@ -134,18 +157,14 @@ mod x86 {
             }
         };
         (@first $name:ident, $parts:literal,
-         [$load:ident, $store:ident, $bytes:ident, $words:ident, $zero:ident, $sub8:ident, $add8:ident, $lt:ident, $maskz:ident,
-          $pairs:ident],
+         [$load:ident, $store:ident, $words:ident, $zero:ident, $sub8:ident, $add8:ident, $pairs:ident],
          $v:ty, $add:ident, |$a:ident, $b:ident| $widened:expr) => {
             /// # Safety
             /// As above; as many moves as columns.
             #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx2")]
-            pub unsafe fn $name<S, const L: usize>(
-                thresholds: &[u8; L], columns: &mut [[u8; L]], m: Moves, sums: &mut [[S; L]],
-            ) {
+            pub unsafe fn $name<S, const L: usize>(columns: &mut [[u8; L]], m: Moves<L>, sums: &mut [[S; L]]) {
                 // SAFETY: as the caller promised.
                 unsafe {
-                    let thresholds = $load(thresholds.as_ptr().cast());
                     let (even, odd) = ($words(0x0001), $words(0x0100));
                     let (width, all) = (sums.len() - 1, columns.len());
                     let columns = columns.as_mut_ptr();
@@ -155,11 +174,10 @@ mod x86 {
                         let mut change = $zero();
                         let mut i = x;
                         while i < all {
-                            let at = |bytes: &[u8]| $bytes(*bytes.get_unchecked(i) as i8);
-                            let moved = $lt($sub8(thresholds, at(m.low)), at(m.length));
-                            let by = $maskz(moved, at(m.sign));
+                            let [enters, leaves] = m.rows(i);
+                            let by = $sub8($load(enters.cast()), $load(leaves.cast()));
                             let column = columns.add(i).cast();
-                            $store(column, $add8($load(column.cast_const()), by));
+                            $store(column, $add8($load(column.cast_const().cast()), by));
                             change = $add8(change, by);
                             i += width;
                         }
@@ -176,13 +194,11 @@ mod x86 {
     }
 
     steps! {
-        narrow_32, wide_32, first_narrow_32, first_wide_32, __m256i, _mm256_loadu_si256, _mm256_storeu_si256, _mm256_set1_epi8,
-        _mm256_set1_epi16, _mm256_setzero_si256, _mm256_sub_epi8, _mm256_add_epi8, _mm256_cmplt_epu8_mask, _mm256_mask_add_epi8,
-        _mm256_maskz_mov_epi8, _mm256_maddubs_epi16, _mm256_add_epi16, _mm256_add_epi32, _mm256_and_si256, _mm256_srli_epi16,
+        narrow_32, wide_32, first_narrow_32, first_wide_32, shift_32, __m256i, _mm256_loadu_si256, _mm256_storeu_si256,
+        _mm256_set1_epi16, _mm256_setzero_si256, _mm256_sub_epi8, _mm256_add_epi8, _mm256_maddubs_epi16, _mm256_add_epi16, _mm256_add_epi32, _mm256_and_si256, _mm256_srli_epi16,
         _mm256_sub_epi16, low_256, high_256;
-        narrow_64, wide_64, first_narrow_64, first_wide_64, __m512i, _mm512_loadu_si512, _mm512_storeu_si512, _mm512_set1_epi8,
-        _mm512_set1_epi16, _mm512_setzero_si512, _mm512_sub_epi8, _mm512_add_epi8, _mm512_cmplt_epu8_mask, _mm512_mask_add_epi8,
-        _mm512_maskz_mov_epi8, _mm512_maddubs_epi16, _mm512_add_epi16, _mm512_add_epi32, _mm512_and_si512, _mm512_srli_epi16,
+        narrow_64, wide_64, first_narrow_64, first_wide_64, shift_64, __m512i, _mm512_loadu_si512, _mm512_storeu_si512,
+        _mm512_set1_epi16, _mm512_setzero_si512, _mm512_sub_epi8, _mm512_add_epi8, _mm512_maddubs_epi16, _mm512_add_epi16, _mm512_add_epi32, _mm512_and_si512, _mm512_srli_epi16,
         _mm512_sub_epi16, low_512, high_512;
     }
 

@@ -4,16 +4,16 @@
 //! are counted one by one ([`super::buckets`]).
 
 use super::buckets::{self, Buckets};
+use super::read::{Counting, Group, MOST, Mask, Places, extent, quotient};
 use super::{Key, Plan, ToKey, gone};
 use crate::brick::scratch::{cut, padded};
 use crate::grid::{DType, Shape, View, ViewMut};
-use crate::kernel::levels::sums::{NEVER, Row, Sum, Tile, Windows, Work, sweep};
+use crate::kernel::levels::search::{as_bytes, bytes};
+use crate::kernel::levels::sums::{Asked, NEVER, Sum, Tile, Windows, Work, sweep};
 use crate::kernel::simd::Level;
 use crate::multiversion;
 use crate::stage::Ties;
 
-/// Most thresholds of a tile.
-const MOST: usize = 256;
 /// Most of them that one sweep counts.
 const LANES: usize = 64;
 
@@ -27,10 +27,10 @@ pub(super) trait Index: Key {
 
 impl Index for i8 {
     const KEYS: usize = 1 << 8;
-    /// At radius 10 with 256 thresholds, 64 x 128 rows and columns take 21.9 ns per voxel, 64 x 96 take 24.5, 64 x 64 take
-    /// 24.8, 96 x 96 in a later build 21.6 beside 19.8: 64 thresholds' columns fill most of the L2 cache, and the rest is
-    /// edges (2-core Zen 4 VM, AVX-512, 2026-11-26).
-    const TILE: Shape = [128, 64, 128];
+    /// At radius 10 with 256 thresholds, 64 x 256 rows and columns take 16.4 ns per voxel, 64 x 128 take 16.7, 48 x 128 take 17.9,
+    /// 64 x 96 take 18.2, 32 x 256 take 17.7: edges cost more than columns beyond the L2 cache (2-core Zen 4 VM, AVX-512,
+    /// 2026-11-27).
+    const TILE: Shape = [128, 64, 256];
     #[inline(always)]
     fn index(self) -> usize {
         usize::from(self as u8 ^ 0x80)
@@ -78,13 +78,13 @@ pub(super) fn scratch_bytes<K: Index>(plan: &Plan) -> usize {
     padded::<u8>(K::KEYS) + padded::<u8>(tile.codes()) + Work::<u32>::bytes(&tile, LANES) + buckets
 }
 
-/// Voxels of a window from which this way is the faster one. 8 bits: at radius 5 (1331 voxels) comparing takes 18.7 ns per
-/// voxel and this 24.7, at radius 10 sliding histograms take 73.6 and this 36.5 (19.8 since one group of thresholds is swept
-/// after the other). 16 bits with many values: at radius 10 (9261 voxels) comparing takes 166 and this 217; at radius 64 this
-/// takes 2.3 us, and comparing, which grows with the window, some 38 us by extrapolation. One insertion of all voxels in the
-/// order of their keys into sums over blocks took 130 ns at radius 10 in a prototype and 5 us at 64 (2-core Zen 4 VM, AVX-512,
-/// 2026-11-26).
-const FROM: [usize; 2] = [1500, 15_000];
+/// Voxels of a window from which this way is the faster one. 8 bits, 256 thresholds: at radius 3 (343 voxels) comparing takes
+/// 8.7 ns per voxel and this 13.4, at radius 4 (729) 12.4 and 13.7, at radius 5 (1331) 18.3 and 14.2, at radius 6 25.2 and 14.3,
+/// at radius 8 48.3 and 15.3. 16 bits with many values: at radius 8 (4913) 92 and 222, at radius 11 (12167) 207 and 265, at
+/// radius 12 (15625) 265 and 207; at radius 64 this takes 2.3 us, and comparing, which grows with the window, some 38 us by
+/// extrapolation. One insertion of all voxels in the order of their keys into sums over blocks took 130 ns at radius 10 in a
+/// prototype and 5 us at 64 (2-core Zen 4 VM, AVX-512, 2026-11-27).
+const FROM: [usize; 2] = [900, 15_000];
 
 /// Whether windows are counted this way: their planes fit in a byte, and there are enough voxels.
 pub(super) fn serves(plan: &Plan, dtype: DType) -> bool {
@@ -132,7 +132,7 @@ fn count_tile<T: ToKey<K>, K: Index>(
         (None, bytes)
     };
     let thresholds = single.or(buckets.as_ref().map(|b| b.thresholds)).unwrap_or(0);
-    let gaps = fill_codes::<T, K>(source, table, codes);
+    let gaps = fill_codes::<T, K>(level, source, table, codes);
     let job = Job { level, codes, tile, thresholds, gaps, ties };
     match (thresholds < 32, tile.fits::<u16>()) {
         (true, true) => job.run::<u16, 32>(bytes, &mut buckets, out),
@@ -182,12 +182,16 @@ fn mark_values<T: ToKey<K>, K: Index>(source: &Source<T>, tile: &Tile, ties: Tie
 }
 
 /// Codes of the source box; returns whether any voxel is missing.
-fn fill_codes<T: ToKey<K>, K: Index>(source: &Source<T>, table: &[u8], codes: &mut [u8]) -> bool {
+fn fill_codes<T: ToKey<K>, K: Index>(level: Level, source: &Source<T>, table: &[u8], codes: &mut [u8]) -> bool {
     let mut any = false;
     let [_, rows, width] = source.view.shape;
     for (i, codes) in codes.chunks_exact_mut(width).enumerate() {
         let row = source.view.row_at(i / rows, i % rows);
-        codes.iter_mut().zip(row).for_each(|(c, v)| *c = table[source.index::<K>(*v)]);
+        match (as_bytes(row), table.first_chunk()) {
+            // Indices are the bits, turned around or not.
+            (Some(row), Some(table)) => bytes(level, row, table, source.index::<K>(T::default()) as u8, codes),
+            _ => codes.iter_mut().zip(row).for_each(|(c, v)| *c = table[source.index::<K>(*v)]),
+        }
         if source.missing.is_some() {
             for (c, _) in codes.iter_mut().zip(row).filter(|(_, v)| gone(**v, source.missing)) {
                 *c = NEVER;
@@ -223,12 +227,27 @@ impl Job<'_> {
     fn run<S: Sum, const L: usize>(&self, bytes: &mut [u8], buckets: &mut Option<Buckets>, out: &mut ViewMut<f32>) {
         let tile = self.tile;
         let mut work = Work::<S>::cut(bytes, tile, L);
-        let windows = Windows::of_columns(tile);
+        let (windows, mut places) = (Windows::of_columns(tile), Places::new());
         for group in self.groups::<L>() {
             let lanes = group.lanes();
-            sweep::<S, L>(self.level, self.codes, tile, &lanes, &mut work, |z, y, row| {
+            let centres = |z: usize, y: usize| {
                 let place = ((tile.at[0] + z) * tile.src[1] + tile.at[1] + y) * tile.src[2] + tile.at[2];
-                let centres = &self.codes[place..][..tile.dst[2]];
+                &self.codes[place..][..tile.dst[2]]
+            };
+            let asked = |z: usize| {
+                let mut all = Mask::default();
+                let mut rows = 0;
+                for y in 0..tile.dst[1] {
+                    let own = group.members(self.level, centres(z, y));
+                    if own != Mask::default() {
+                        rows = y + 1;
+                        all.iter_mut().zip(own).for_each(|(all, own)| *all |= own);
+                    }
+                }
+                Asked { rows, columns: extent(all) }
+            };
+            sweep::<S, L>(self.level, self.codes, tile, &lanes, &mut work, asked, |z, y, row| {
+                let centres = centres(z, y);
                 let rows = (tile.window(0, z).len() * tile.window(1, y).len()) as u32;
                 let counting = Counting { centres, row, windows: &windows, rows, group: &group };
                 match buckets {
@@ -236,11 +255,11 @@ impl Job<'_> {
                         if y + 1 < tile.dst[1] {
                             fetch(out.row_at(z, y + 1));
                         }
-                        quotients(self.level, counting, out.row_at(z, y));
+                        counting.openness(self.level, &mut places, out.row_at(z, y));
                     }
                     Some(b) => {
                         let (counted, sizes, single) = b.row_mut(tile, z, y);
-                        counts(self.level, counting, single, counted, sizes);
+                        counting.counts(self.level, single, counted, sizes);
                     }
                 }
             });
@@ -261,27 +280,6 @@ impl Job<'_> {
     }
 }
 
-/// Codes whose voxels are counted in one sweep.
-struct Group {
-    code: u8,
-    codes: u8,
-    /// Threshold of the first lane; the others follow.
-    first: u8,
-    /// The last lane counts all voxels but missing ones.
-    gaps: bool,
-    /// Voxels below the centre are counted as well.
-    mid: bool,
-}
-
-impl Group {
-    fn lanes<const L: usize>(&self) -> [u8; L] {
-        std::array::from_fn(|k| match self.gaps && k == L - 1 {
-            true => NEVER - 1,
-            false => self.first.saturating_add(k as u8),
-        })
-    }
-}
-
 /// Asks for a row that is written soon: of all voxels, a group writes a few here and there.
 #[inline(always)]
 fn fetch(row: &[f32]) {
@@ -292,102 +290,6 @@ fn fetch(row: &[f32]) {
         unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
     }
     let _ = row;
-}
-
-/// A row of centres, and what its windows are counted by.
-struct Counting<'a, S, const L: usize> {
-    centres: &'a [u8],
-    row: Row<'a, S, L>,
-    windows: &'a Windows,
-    /// Rows of each window.
-    rows: u32,
-    group: &'a Group,
-}
-
-impl<S: Sum, const L: usize> Counting<'_, S, L> {
-    /// Which of up to 64 centres from `first` on are of the group: bit i for centre i.
-    #[inline(always)]
-    fn members(&self, first: usize) -> u64 {
-        let centres = &self.centres[first..];
-        let (code, codes) = (self.group.code, self.group.codes);
-        let mut padded = [code.wrapping_sub(1); 64];
-        let n = centres.len().min(64);
-        padded[..n].copy_from_slice(&centres[..n]);
-        let mut mask = 0;
-        for (i, c) in padded.iter().enumerate() {
-            mask |= u64::from(c.wrapping_sub(code) < codes) << i;
-        }
-        mask
-    }
-
-    /// Voxels not above centre `x`, with `ties = "mid"` plus those below it, and the size of the window (twice); `alone`: the
-    /// code stands for one value. Where it does not, all of its voxels count as not above.
-    #[inline(always)]
-    fn count(&self, x: usize, alone: bool) -> (u32, u32) {
-        let (columns, code, group) = (self.windows.of(x), self.centres[x], self.group);
-        let lane = usize::from(code.wrapping_sub(group.first)) % L;
-        let counted = self.row.count(&columns, lane);
-        let size = if group.gaps { self.row.count(&columns, L - 1) } else { self.rows * columns.len() as u32 };
-        if !group.mid {
-            return (counted, size);
-        }
-        let below = match code {
-            _ if !alone => counted,
-            0 => 0,
-            _ => self.row.count(&columns, (lane + L - 1) % L),
-        };
-        (counted + below, 2 * size)
-    }
-}
-
-multiversion! {
-    /// Openness of the centres of a group.
-    fn quotients['a, S: Sum, const L: usize](counting: Counting<'a, S, L>, out: &mut [f32]) -> () = quotients_inner;
-}
-
-#[inline(always)]
-fn quotients_inner<S: Sum, const L: usize>(counting: Counting<S, L>, out: &mut [f32]) {
-    for first in (0..counting.centres.len()).step_by(64) {
-        let mut mask = counting.members(first);
-        while mask != 0 {
-            let x = first + mask.trailing_zeros() as usize;
-            mask &= mask - 1;
-            let (counted, size) = counting.count(x, true);
-            // Integers below 2^24 are f32, and their quotient is rounded once.
-            let narrow = 2 * S::MOST < 1 << 24;
-            out[x] = if narrow { counted as f32 / size as f32 } else { quotient(counted, size) };
-        }
-    }
-}
-
-multiversion! {
-    /// Counts of the centres of a group; `single` says whether a code stands for one value.
-    fn counts['a, S: Sum, const L: usize](
-        counting: Counting<'a, S, L>, single: &[bool; MOST], counted: &mut [u32], sizes: &mut [u32],
-    ) -> () = counts_inner;
-}
-
-#[inline(always)]
-fn counts_inner<S: Sum, const L: usize>(
-    counting: Counting<S, L>,
-    single: &[bool; MOST],
-    counted: &mut [u32],
-    sizes: &mut [u32],
-) {
-    for first in (0..counting.centres.len()).step_by(64) {
-        let mut mask = counting.members(first);
-        while mask != 0 {
-            let x = first + mask.trailing_zeros() as usize;
-            mask &= mask - 1;
-            (counted[x], sizes[x]) = counting.count(x, single[usize::from(counting.centres[x])]);
-        }
-    }
-}
-
-/// The quotient of two integers below 2^53, rounded to f64 and then to f32 as if at once (see `Counts::openness`).
-#[inline(always)]
-fn quotient(counted: u32, size: u32) -> f32 {
-    (f64::from(counted) / f64::from(size)) as f32
 }
 
 multiversion! {

@@ -8,6 +8,7 @@
 mod buckets;
 mod coded;
 mod compare;
+mod read;
 mod slide;
 mod vector;
 

@@ -220,3 +220,24 @@ fn all_256_values_of_a_byte_are_thresholds() {
         }
     }
 }
+
+#[test]
+fn groups_of_thresholds_that_a_part_of_a_plane_asks_for() {
+    // A slope through all groups, which come and go from plane to plane.
+    let shape = [6, 70, 90];
+    let mut noise = crate::kernel::hostile::Noise(3);
+    let shift = [0, 90, 0, 150, 10, 200];
+    let whole = Region::whole(shape);
+    let at = |q: [i64; 3]| (q[1] * 2 + q[2] / 2 + shift[q[0] as usize]) as usize;
+    let v: Vec<u8> = whole.iter().map(|q| ((at(q) + noise.below(9)) % 256) as u8).collect();
+    for (missing, low) in [(None, false), (None, true), (Some(77), false)] {
+        let p = params([1, 3, 4], missing, low);
+        for ties in [Ties::Le, Ties::Mid] {
+            let expect = reference(&Voxels::U8(v.clone()), shape, &p, WindowShape::Box, ties);
+            for level in Level::available() {
+                let got = coded_openness::<u8, i8>(View::dense(&v, shape), &p, ties, level);
+                same(&got, &expect, &format!("{missing:?} {low} {ties:?} {level:?}"));
+            }
+        }
+    }
+}
