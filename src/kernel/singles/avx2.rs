@@ -142,6 +142,21 @@ impl F32x32 for Avx2 {
         }
     }
     #[inline(always)]
+    unsafe fn store_codes(self, to: *mut u8) {
+        unsafe {
+            let low = _mm256_set1_epi32(0xff);
+            let a = _mm256_and_si256(_mm256_castps_si256(self.0), low);
+            let b = _mm256_and_si256(_mm256_castps_si256(self.1), low);
+            let c = _mm256_and_si256(_mm256_castps_si256(self.2), low);
+            let d = _mm256_and_si256(_mm256_castps_si256(self.3), low);
+            let (a, b) = (_mm256_packs_epi32(a, b), _mm256_packs_epi32(c, d));
+            // Packing interleaves the halves of its operands, in fours.
+            let order = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+            let codes = _mm256_permutevar8x32_epi32(_mm256_packus_epi16(a, b), order);
+            _mm256_storeu_si256(to.cast(), codes);
+        }
+    }
+    #[inline(always)]
     fn plus(self, o: Self) -> Self {
         four!(_mm256_add_ps, self, o)
     }

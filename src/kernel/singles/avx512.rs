@@ -93,6 +93,24 @@ impl F32x32 for Avx512 {
         }
     }
     #[inline(always)]
+    unsafe fn store_codes(self, to: *mut u8) {
+        // One permutation takes the lowest bytes of both vectors: narrowing stores are slower.
+        const LOWEST: [u8; 64] = {
+            let mut at = [0; 64];
+            let mut i = 0;
+            while i < 32 {
+                at[i] = 4 * i as u8;
+                i += 1;
+            }
+            at
+        };
+        unsafe {
+            let (a, b) = (_mm512_castps_si512(self.0), _mm512_castps_si512(self.1));
+            let codes = _mm512_permutex2var_epi8(a, _mm512_loadu_si512(LOWEST.as_ptr().cast()), b);
+            _mm256_storeu_si256(to.cast(), _mm512_castsi512_si256(codes));
+        }
+    }
+    #[inline(always)]
     fn plus(self, o: Self) -> Self {
         two!(_mm512_add_ps, self, o)
     }

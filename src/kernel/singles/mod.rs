@@ -52,6 +52,11 @@ pub trait F32x32: Copy {
     /// # Safety
     /// 32 values can be written there.
     unsafe fn store(self, to: *mut f32);
+    /// The lowest eight bits of every value.
+    ///
+    /// # Safety
+    /// 32 codes can be written there.
+    unsafe fn store_codes(self, to: *mut u8);
     fn plus(self, o: Self) -> Self;
     fn minus(self, o: Self) -> Self;
     fn times(self, o: Self) -> Self;
@@ -146,6 +151,12 @@ impl F32x32 for Plain {
         unsafe { to.cast::<[f32; SINGLES]>().write_unaligned(self.0) }
     }
     #[inline(always)]
+    unsafe fn store_codes(self, to: *mut u8) {
+        let codes = self.0.map(|v| v.to_bits() as u8);
+        // SAFETY: the caller's promise.
+        unsafe { to.cast::<[u8; SINGLES]>().write_unaligned(codes) }
+    }
+    #[inline(always)]
     fn plus(self, o: Self) -> Self {
         self.zip(o, |a, b| a + b)
     }
@@ -237,12 +248,16 @@ mod tests {
     use crate::kernel::simd::Level;
 
     #[inline(always)]
-    fn all_inner<V: F32x32, const K: usize>(a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>) {
+    fn all_inner<V: F32x32, const K: usize>(a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>, low: &mut Vec<u8>) {
         let mut put = |v: V| {
             let mut row = [0.0f32; SINGLES];
             // SAFETY: 32 values.
             unsafe { v.store(row.as_mut_ptr()) };
             out.extend(row.map(f32::to_bits));
+            let mut codes = [0u8; SINGLES];
+            // SAFETY: 32 codes.
+            unsafe { v.store_codes(codes.as_mut_ptr()) };
+            low.extend(codes);
         };
         let bytes = codes.map(|c| c as u8);
         let (words, doubles) = (codes.map(|c| c as u32 * 32_000), codes.map(|c| c as f64 / 3.0));
@@ -284,21 +299,23 @@ mod tests {
         }
     }
 
-    crate::on_singles! { fn all[const K: usize](a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>) = all_inner[K]; }
+    crate::on_singles! { fn all[const K: usize](a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>, low: &mut Vec<u8>) = all_inner[K]; }
 
     #[test]
     fn every_level_gives_the_same_bits() {
         let mut a: [f32; 96] = std::array::from_fn(|i| ((i * 37 % 96) as f32 - 40.0) / 3.0);
         (a[3], a[4], a[5]) = (0.0, -0.0, 1e-30);
         let codes = std::array::from_fn(|i| (i * 2113 % 65_536) as u16);
-        let mut first: Option<Vec<u32>> = None;
+        let mut first: Option<(Vec<u32>, Vec<u8>)> = None;
         for level in Level::available() {
-            let mut out = Vec::new();
-            all::<0>(level, &a, &codes, &mut out);
+            let (mut out, mut low) = (Vec::new(), Vec::new());
+            all::<0>(level, &a, &codes, &mut out, &mut low);
+            assert!(out.iter().zip(&low).all(|(v, low)| *v as u8 == *low), "{level:?}");
             assert_eq!(out[0], (a[0] + a[32]).to_bits());
             let power = f32::from_bits(out[17 * SINGLES + 7]).exp2() * (1.0 + f32::from_bits(out[18 * SINGLES + 7]));
             assert!((power - a[7].abs() - 1e-3).abs() < 1e-5);
-            assert_eq!(first.get_or_insert_with(|| out.clone()), &out, "{level:?}");
+            let all = (out, low);
+            assert_eq!(first.get_or_insert_with(|| all.clone()), &all, "{level:?}");
         }
     }
 }

@@ -95,7 +95,7 @@ impl Job {
         let tile = [even(dst[1], rows), width];
         let height = tile[0] + 2 * radius[1];
         let row_block = block(window[1], tile[0]);
-        let rows = row_block * if window[1] < DEEP { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
+        let rows = if window[1] < DEEP { ROWS } else { row_block * 4.min(tile[0].div_ceil(row_block)) };
         let skip = [0; 3];
         Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
     }
@@ -144,12 +144,20 @@ impl Job {
         ((c + r + 1).min(self.src[a] as isize) - (c - r).max(0)).max(0) as usize
     }
 
+    /// Elements from row to row of finished windows.
+    pub fn out_pitch(&self) -> usize {
+        self.tile[1].next_multiple_of(64)
+    }
+
     /// Elements of a tile plane.
     pub fn plane(&self) -> usize {
         self.height * self.pitch
     }
 }
 
+/// Output rows of integers that go through x and the estimators together, so that few calls are made: a multiple of every
+/// block.
+pub const ROWS: usize = 8;
 /// Widest tile in x.
 const MAX_WIDTH: usize = 512;
 /// The same for floats, whose planes hold sums of 8 and 16 bytes.
