@@ -257,7 +257,7 @@ crate::multiversion! {
     /// Sums along y for `count` output rows from `first` on: each is the row before it with the last line of its window and
     /// without the line before its window (there is none at 0). Row 0 of `rows` is the one before `first`.
     fn slide_rows[Z: Acc, Y: Acc + From<Z>](
-        plane: &[Z], first: usize, w: usize, pitch: usize, count: usize, rows: &mut [Y]
+        plane: &[Z], first: usize, w: usize, pitch: usize, columns: usize, count: usize, rows: &mut [Y]
     ) -> () = slide_rows_inner;
 }
 
@@ -267,13 +267,14 @@ fn slide_rows_inner<Z: Acc, Y: Acc + From<Z>>(
     first: usize,
     w: usize,
     pitch: usize,
+    columns: usize,
     count: usize,
     rows: &mut [Y],
 ) {
     for k in 0..count {
         let (before, after) = rows.split_at_mut((k + 1) * pitch);
-        let (run, out) = (&before[k * pitch..], &mut after[..pitch]);
-        let line = |y: usize| &plane[y * pitch..][..pitch];
+        let (run, out) = (&before[k * pitch..][..columns], &mut after[..columns]);
+        let line = |y: usize| &plane[y * pitch..][..columns];
         let new = line(first + k + w - 1);
         if first + k == 0 {
             for ((o, r), a) in out.iter_mut().zip(run).zip(new) {
@@ -307,14 +308,14 @@ where
         let run = &mut self.rows[..job.pitch];
         run.fill(Y::default());
         for y in 0..job.window[1] - 1 {
-            add_row(level, &self.plane[y * job.pitch..][..job.pitch], run);
+            add_row(level, &self.plane[y * job.pitch..][..job.columns()], run);
         }
     }
 
     /// Sums of the windows of `rows` output rows from `y` of the tile on, left in `out`.
     fn finish_rows(&mut self, level: Level, job: &Job, y: usize, rows: usize) {
         let (w, n, pitch) = (job.window[2], job.tile[1], job.pitch);
-        slide_rows(level, self.plane, y, job.window[1], pitch, rows, self.rows);
+        slide_rows(level, self.plane, y, job.window[1], pitch, job.columns(), rows, self.rows);
         let made = &self.rows[pitch..][..rows * pitch];
         let from = if self.wide.is_empty() {
             bits::<X, Y>(made)

@@ -92,7 +92,7 @@ impl Job {
         let batch = planes * deep.min(dst[0].div_ceil(planes));
         let rows =
             (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
-        let tile = [even(dst[1], rows), width];
+        let tile = [even(dst[1], rows).next_multiple_of(ROWS).min(dst[1]), width];
         let height = tile[0] + 2 * radius[1];
         let row_block = block(window[1], tile[0]);
         let rows = if window[1] < DEEP { ROWS } else { row_block * 4.min(tile[0].div_ceil(row_block)) };
@@ -147,6 +147,11 @@ impl Job {
     /// Elements from row to row of finished windows.
     pub fn out_pitch(&self) -> usize {
         self.tile[1].next_multiple_of(64)
+    }
+
+    /// Columns of a tile with its halo, in whole vectors: what lies between them and the pitch is never read.
+    pub fn columns(&self) -> usize {
+        (self.tile[1] + self.window[2] - 1).next_multiple_of(32)
     }
 
     /// Elements of a tile plane.
