@@ -109,7 +109,7 @@ impl Job {
         let pitch = odd_lines(width + 2 * radius[2]);
         // Groups along z are made anew by each batch.
         let batch = most[0].min(BLOCK * if window[0] < DEEP { 1 } else { 4 });
-        let rows = (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
+        let rows = (FLOAT_TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
         let tile = [most[1].min(rows.max(2 * radius[1]).next_multiple_of(BLOCK)), width];
         let height = tile[0] + 2 * radius[1];
         let (planes, row_block) = (block(window[0], batch), block(window[1], tile[0]));
@@ -169,10 +169,13 @@ const MAX_WIDTH: usize = 512;
 const FLOAT_WIDTH: usize = 256;
 /// Fewest rows of a tile (if there are as many).
 const MIN_ROWS: usize = 32;
-/// Bytes of batch planes to aim at: they and the raw planes share a 1 MiB L2. 2-core Zen 4 VM, AVX-512, 2026-11-23, busy
-/// machine, cdf_power r=10 in ns/voxel (u8, u16, f32): 3.2, 4.4, 11.7 with 640 KiB; 3.6, 4.6, 12.2 with 200 kB; 3.2, 4.6,
+/// Bytes of batch planes to aim at. They share a 1 MiB L2 with the raw planes, but low tiles make many rows twice, and what
+/// spills is read in order. 2-core Zen 4 VM, AVX-512, 2026-11-27, r=10, ns/voxel with 640 KiB, 1280 KiB and 2 MiB:
+/// cdf_power u16 2.11, 1.98, 1.99; chebyshev u16 1.99, 1.84, 1.87; four moments u8 2.65, 2.50, 2.57.
+const TILE_BYTES: usize = 1280 << 10;
+/// The same for floats: 2-core Zen 4 VM, AVX-512, 2026-11-23, busy machine, cdf_power f32 11.7 with 640 KiB, 12.2 with 200 kB,
 /// 13.2 with 1.3 MB.
-const TILE_BYTES: usize = 640 << 10;
+const FLOAT_TILE_BYTES: usize = 640 << 10;
 
 /// Parts as even as can be of at most `most`.
 fn even(n: usize, most: usize) -> usize {
