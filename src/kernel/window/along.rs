@@ -18,6 +18,7 @@ pub trait RowExtremes: Sized {
     /// In every row `out_lo[i]` is the least of `lo[i..i + w]` and `out_hi[i]` the greatest of `hi[i..i + w]` for `i < n`,
     /// with sources of `roomy(n)` elements and results of `n` rounded up to 64. Returns false, with nothing done, where the level
     /// or the window asks for the tree.
+    #[allow(clippy::too_many_arguments)]
     fn windows(
         _level: Level,
         _lo: &[Self],
