@@ -29,14 +29,6 @@ unsafe fn load_u16(from: *const u16, flip: u16) -> __m256i {
 }
 
 #[inline(always)]
-unsafe fn load_f64(from: *const f64) -> __m256 {
-    unsafe {
-        let (a, b) = (_mm256_cvtpd_ps(_mm256_loadu_pd(from)), _mm256_cvtpd_ps(_mm256_loadu_pd(from.add(4))));
-        _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(a), b)
-    }
-}
-
-#[inline(always)]
 unsafe fn blank256(v: __m256) -> __m256 {
     unsafe { _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_castps_si256(v), _mm256_setzero_si256())) }
 }
@@ -124,13 +116,6 @@ impl F32x32 for Avx2 {
     #[inline(always)]
     fn of_int(v: Int) -> Self {
         four!(_mm256_cvtepi32_ps, v)
-    }
-    #[inline(always)]
-    unsafe fn of_f64(from: *const f64) -> Self {
-        unsafe {
-            let (a, b) = (load_f64(from), load_f64(from.add(8)));
-            Avx2(a, b, load_f64(from.add(16)), load_f64(from.add(24)))
-        }
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut f32) {

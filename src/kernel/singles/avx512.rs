@@ -75,17 +75,6 @@ impl F32x32 for Avx512 {
         two!(_mm512_cvtepi32_ps, v)
     }
     #[inline(always)]
-    unsafe fn of_f64(from: *const f64) -> Self {
-        unsafe {
-            let a = _mm512_cvtpd_ps(_mm512_loadu_pd(from));
-            let b = _mm512_cvtpd_ps(_mm512_loadu_pd(from.add(8)));
-            let c = _mm512_cvtpd_ps(_mm512_loadu_pd(from.add(16)));
-            let d = _mm512_cvtpd_ps(_mm512_loadu_pd(from.add(24)));
-            let join = _mm512_insertf32x8::<1>(_mm512_castps256_ps512(a), b);
-            Avx512(join, _mm512_insertf32x8::<1>(_mm512_castps256_ps512(c), d))
-        }
-    }
-    #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
         unsafe {
             _mm512_storeu_ps(to, self.0);
