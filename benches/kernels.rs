@@ -64,7 +64,7 @@ fn call(
     window(src, p, Place::whole([0; 3]), &mut outs, cx);
 }
 
-/// `coded`: openness as bytes, as a run writes it unless asked for floats.
+/// `coded`: openness as bytes, as callers of the library may ask for; a run keeps floats until it writes them.
 fn outputs(dtype: DType, shape: Shape, channels: &[WindowChannel], coded: bool) -> Vec<Voxels> {
     let kind = |c: WindowChannel| match c {
         WindowChannel::Openness(..) if coded => DType::U8,
@@ -128,7 +128,7 @@ fn main() {
     let filters: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
     let open = |m| vec![WindowChannel::Openness(m, Ties::Le)];
     let four = vec![WindowChannel::Mean, WindowChannel::Min, WindowChannel::Max, WindowChannel::Variance];
-    // Openness goes to bytes, as in a run that does not ask for more, and to floats.
+    // Openness goes to bytes, and to floats as in a run.
     let kernels = [
         ("cdf_power", open(Method::CdfPower), true),
         ("gaussian_cdf", open(Method::GaussianCdf), true),

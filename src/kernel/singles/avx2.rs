@@ -29,14 +29,6 @@ unsafe fn load_u16(from: *const u16, flip: u16) -> __m256i {
 }
 
 #[inline(always)]
-unsafe fn load_f64(from: *const f64) -> __m256 {
-    unsafe {
-        let (a, b) = (_mm256_cvtpd_ps(_mm256_loadu_pd(from)), _mm256_cvtpd_ps(_mm256_loadu_pd(from.add(4))));
-        _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(a), b)
-    }
-}
-
-#[inline(always)]
 unsafe fn blank256(v: __m256) -> __m256 {
     unsafe { _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_castps_si256(v), _mm256_setzero_si256())) }
 }
@@ -126,19 +118,27 @@ impl F32x32 for Avx2 {
         four!(_mm256_cvtepi32_ps, v)
     }
     #[inline(always)]
-    unsafe fn of_f64(from: *const f64) -> Self {
-        unsafe {
-            let (a, b) = (load_f64(from), load_f64(from.add(8)));
-            Avx2(a, b, load_f64(from.add(16)), load_f64(from.add(24)))
-        }
-    }
-    #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
         unsafe {
             _mm256_storeu_ps(to, self.0);
             _mm256_storeu_ps(to.add(8), self.1);
             _mm256_storeu_ps(to.add(16), self.2);
             _mm256_storeu_ps(to.add(24), self.3);
+        }
+    }
+    #[inline(always)]
+    unsafe fn store_codes(self, to: *mut u8) {
+        unsafe {
+            let low = _mm256_set1_epi32(0xff);
+            let a = _mm256_and_si256(_mm256_castps_si256(self.0), low);
+            let b = _mm256_and_si256(_mm256_castps_si256(self.1), low);
+            let c = _mm256_and_si256(_mm256_castps_si256(self.2), low);
+            let d = _mm256_and_si256(_mm256_castps_si256(self.3), low);
+            let (a, b) = (_mm256_packs_epi32(a, b), _mm256_packs_epi32(c, d));
+            // Packing interleaves the halves of its operands, in fours.
+            let order = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+            let codes = _mm256_permutevar8x32_epi32(_mm256_packus_epi16(a, b), order);
+            _mm256_storeu_si256(to.cast(), codes);
         }
     }
     #[inline(always)]

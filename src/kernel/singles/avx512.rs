@@ -75,21 +75,28 @@ impl F32x32 for Avx512 {
         two!(_mm512_cvtepi32_ps, v)
     }
     #[inline(always)]
-    unsafe fn of_f64(from: *const f64) -> Self {
-        unsafe {
-            let a = _mm512_cvtpd_ps(_mm512_loadu_pd(from));
-            let b = _mm512_cvtpd_ps(_mm512_loadu_pd(from.add(8)));
-            let c = _mm512_cvtpd_ps(_mm512_loadu_pd(from.add(16)));
-            let d = _mm512_cvtpd_ps(_mm512_loadu_pd(from.add(24)));
-            let join = _mm512_insertf32x8::<1>(_mm512_castps256_ps512(a), b);
-            Avx512(join, _mm512_insertf32x8::<1>(_mm512_castps256_ps512(c), d))
-        }
-    }
-    #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
         unsafe {
             _mm512_storeu_ps(to, self.0);
             _mm512_storeu_ps(to.add(16), self.1);
+        }
+    }
+    #[inline(always)]
+    unsafe fn store_codes(self, to: *mut u8) {
+        // One permutation takes the lowest bytes of both vectors: narrowing stores are slower.
+        const LOWEST: [u8; 64] = {
+            let mut at = [0; 64];
+            let mut i = 0;
+            while i < 32 {
+                at[i] = 4 * i as u8;
+                i += 1;
+            }
+            at
+        };
+        unsafe {
+            let (a, b) = (_mm512_castps_si512(self.0), _mm512_castps_si512(self.1));
+            let codes = _mm512_permutex2var_epi8(a, _mm512_loadu_si512(LOWEST.as_ptr().cast()), b);
+            _mm256_storeu_si256(to.cast(), _mm512_castsi512_si256(codes));
         }
     }
     #[inline(always)]

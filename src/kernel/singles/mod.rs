@@ -44,14 +44,14 @@ pub trait F32x32: Copy {
     fn times_int(a: Self::Int, b: Self::Int) -> Self::Int;
     /// Of signed values, rounded once.
     fn of_int(v: Self::Int) -> Self;
-    /// Rounded once.
-    ///
-    /// # Safety
-    /// As for [`F32x32::load`].
-    unsafe fn of_f64(from: *const f64) -> Self;
     /// # Safety
     /// 32 values can be written there.
     unsafe fn store(self, to: *mut f32);
+    /// The lowest eight bits of every value.
+    ///
+    /// # Safety
+    /// 32 codes can be written there.
+    unsafe fn store_codes(self, to: *mut u8);
     fn plus(self, o: Self) -> Self;
     fn minus(self, o: Self) -> Self;
     fn times(self, o: Self) -> Self;
@@ -136,14 +136,15 @@ impl F32x32 for Plain {
         Plain(v.map(|v| v as i32 as f32))
     }
     #[inline(always)]
-    unsafe fn of_f64(from: *const f64) -> Self {
-        // SAFETY: the caller's promise.
-        Plain(unsafe { from.cast::<[f64; SINGLES]>().read_unaligned() }.map(|v| v as f32))
-    }
-    #[inline(always)]
     unsafe fn store(self, to: *mut f32) {
         // SAFETY: the caller's promise.
         unsafe { to.cast::<[f32; SINGLES]>().write_unaligned(self.0) }
+    }
+    #[inline(always)]
+    unsafe fn store_codes(self, to: *mut u8) {
+        let codes = self.0.map(|v| v.to_bits() as u8);
+        // SAFETY: the caller's promise.
+        unsafe { to.cast::<[u8; SINGLES]>().write_unaligned(codes) }
     }
     #[inline(always)]
     fn plus(self, o: Self) -> Self {
@@ -237,15 +238,19 @@ mod tests {
     use crate::kernel::simd::Level;
 
     #[inline(always)]
-    fn all_inner<V: F32x32, const K: usize>(a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>) {
+    fn all_inner<V: F32x32, const K: usize>(a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>, low: &mut Vec<u8>) {
         let mut put = |v: V| {
             let mut row = [0.0f32; SINGLES];
             // SAFETY: 32 values.
             unsafe { v.store(row.as_mut_ptr()) };
             out.extend(row.map(f32::to_bits));
+            let mut codes = [0u8; SINGLES];
+            // SAFETY: 32 codes.
+            unsafe { v.store_codes(codes.as_mut_ptr()) };
+            low.extend(codes);
         };
         let bytes = codes.map(|c| c as u8);
-        let (words, doubles) = (codes.map(|c| c as u32 * 32_000), codes.map(|c| c as f64 / 3.0));
+        let words = codes.map(|c| c as u32 * 32_000);
         // SAFETY: 32 values each.
         unsafe {
             let [x, y, z] = [0, 32, 64].map(|i| V::load(a[i..].as_ptr()));
@@ -271,7 +276,6 @@ mod tests {
                 V::of_int(i),
                 V::of_int(j),
                 V::of_int(V::less_int(i, V::times_int(j, k))),
-                V::of_f64(doubles.as_ptr()),
                 e,
                 f,
                 V::splat(1.25).scaled(V::of_int(j)),
@@ -284,21 +288,23 @@ mod tests {
         }
     }
 
-    crate::on_singles! { fn all[const K: usize](a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>) = all_inner[K]; }
+    crate::on_singles! { fn all[const K: usize](a: &[f32; 96], codes: &[u16; 32], out: &mut Vec<u32>, low: &mut Vec<u8>) = all_inner[K]; }
 
     #[test]
     fn every_level_gives_the_same_bits() {
         let mut a: [f32; 96] = std::array::from_fn(|i| ((i * 37 % 96) as f32 - 40.0) / 3.0);
         (a[3], a[4], a[5]) = (0.0, -0.0, 1e-30);
         let codes = std::array::from_fn(|i| (i * 2113 % 65_536) as u16);
-        let mut first: Option<Vec<u32>> = None;
+        let mut first: Option<(Vec<u32>, Vec<u8>)> = None;
         for level in Level::available() {
-            let mut out = Vec::new();
-            all::<0>(level, &a, &codes, &mut out);
+            let (mut out, mut low) = (Vec::new(), Vec::new());
+            all::<0>(level, &a, &codes, &mut out, &mut low);
+            assert!(out.iter().zip(&low).all(|(v, low)| *v as u8 == *low), "{level:?}");
             assert_eq!(out[0], (a[0] + a[32]).to_bits());
-            let power = f32::from_bits(out[17 * SINGLES + 7]).exp2() * (1.0 + f32::from_bits(out[18 * SINGLES + 7]));
+            let power = f32::from_bits(out[16 * SINGLES + 7]).exp2() * (1.0 + f32::from_bits(out[17 * SINGLES + 7]));
             assert!((power - a[7].abs() - 1e-3).abs() < 1e-5);
-            assert_eq!(first.get_or_insert_with(|| out.clone()), &out, "{level:?}");
+            let all = (out, low);
+            assert_eq!(first.get_or_insert_with(|| all.clone()), &all, "{level:?}");
         }
     }
 }

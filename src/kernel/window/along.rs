@@ -2,6 +2,7 @@
 //! neighbour), exact sums as differences of running sums. Other levels use the trees of [`super::lines`], which give the
 //! same bits: extremes do not depend on an order, and integer sums wrap.
 
+use super::lines::Pitches;
 use crate::kernel::simd::Level;
 
 /// Elements beyond the last result, rounded up to 64, that may be read.
@@ -14,9 +15,10 @@ pub fn roomy(n: usize) -> usize {
 
 /// Element types with extremes in registers.
 pub trait RowExtremes: Sized {
-    /// `out_lo[i]` is the least of `lo[i..i + w]` and `out_hi[i]` the greatest of `hi[i..i + w]` for `i < n`, with
-    /// sources of `roomy(n)` elements and results of `n` rounded up to 64. Returns false, with nothing done, where the level
+    /// In every row `out_lo[i]` is the least of `lo[i..i + w]` and `out_hi[i]` the greatest of `hi[i..i + w]` for `i < n`,
+    /// with sources of `roomy(n)` elements and results of `n` rounded up to 64. Returns false, with nothing done, where the level
     /// or the window asks for the tree.
+    #[allow(clippy::too_many_arguments)]
     fn windows(
         _level: Level,
         _lo: &[Self],
@@ -25,6 +27,7 @@ pub trait RowExtremes: Sized {
         _n: usize,
         _out_lo: &mut [Self],
         _out_hi: &mut [Self],
+        _pitches: Pitches,
     ) -> bool {
         false
     }
@@ -32,10 +35,18 @@ pub trait RowExtremes: Sized {
 
 /// Sum types with running sums along a row.
 pub trait RowSums: Sized {
-    /// `out[i]` is the sum of `src[i..i + w]`, modulo the type, for `i < n`; `out` holds `n` and `src` `n + w - 1`
+    /// In every row `out[i]` is the sum of `src[i..i + w]`, modulo the type, for `i < n`; `out` holds `n` and `src` `n + w - 1`
     /// elements, rounded up to 64, `work` 64 more than `src`. Returns false, with nothing done, where the level asks for
     /// the tree.
-    fn windows(_level: Level, _src: &[Self], _w: usize, _n: usize, _out: &mut [Self], _work: &mut [Self]) -> bool {
+    fn windows(
+        _level: Level,
+        _src: &[Self],
+        _w: usize,
+        _n: usize,
+        _out: &mut [Self],
+        _pitches: Pitches,
+        _work: &mut [Self],
+    ) -> bool {
         false
     }
 }
@@ -58,7 +69,7 @@ mod wide {
 mod wide {
     use std::arch::x86_64::*;
 
-    use super::{RowExtremes, RowSums, SLACK, roomy};
+    use super::{Pitches, RowExtremes, RowSums, SLACK, roomy};
     use crate::kernel::simd::Level;
 
     #[inline]
@@ -95,22 +106,27 @@ mod wide {
                     n: usize,
                     out_lo: &mut [$t],
                     out_hi: &mut [$t],
+                    pitches: Pitches,
                 ) -> bool {
                     if level != Level::Avx512 || w == 0 || w >= 2 * $lanes || w > SLACK + 1 {
                         return false;
                     }
                     let (from, to) = (lo.len().min(hi.len()), out_lo.len().min(out_hi.len()));
-                    assert!(roomy(n) <= from && n.next_multiple_of(64) <= to);
+                    if pitches.rows == 0 {
+                        return true;
+                    }
+                    let last = pitches.rows - 1;
+                    assert!(last * pitches.from + roomy(n) <= from && last * pitches.to + n.next_multiple_of(64) <= to);
                     // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
                     unsafe {
                         match w.ilog2() {
-                            0 => $name::<0>(lo, hi, w, n, out_lo, out_hi),
-                            1 => $name::<1>(lo, hi, w, n, out_lo, out_hi),
-                            2 => $name::<2>(lo, hi, w, n, out_lo, out_hi),
-                            3 => $name::<3>(lo, hi, w, n, out_lo, out_hi),
-                            4 => $name::<4>(lo, hi, w, n, out_lo, out_hi),
-                            5 => $name::<5>(lo, hi, w, n, out_lo, out_hi),
-                            _ => $name::<6>(lo, hi, w, n, out_lo, out_hi),
+                            0 => $name::<0>(lo, hi, w, n, out_lo, out_hi, pitches),
+                            1 => $name::<1>(lo, hi, w, n, out_lo, out_hi, pitches),
+                            2 => $name::<2>(lo, hi, w, n, out_lo, out_hi, pitches),
+                            3 => $name::<3>(lo, hi, w, n, out_lo, out_hi, pitches),
+                            4 => $name::<4>(lo, hi, w, n, out_lo, out_hi, pitches),
+                            5 => $name::<5>(lo, hi, w, n, out_lo, out_hi, pitches),
+                            _ => $name::<6>(lo, hi, w, n, out_lo, out_hi, pitches),
                         }
                     }
                     true
@@ -127,6 +143,7 @@ mod wide {
                 n: usize,
                 out_lo: &mut [$t],
                 out_hi: &mut [$t],
+                pitches: Pitches,
             ) {
                 // Lane j takes lane j + by of a vector and its right neighbour, as a part of one long ramp says.
                 const RAMP: [$index; 2 * $lanes] = {
@@ -155,18 +172,23 @@ mod wide {
                     // SAFETY: `start` vectors are less than `roomy(n)` elements, as the caller checked.
                     ($s:ident, $i:expr) => { unsafe { _mm512_loadu_si512($s.as_ptr().add($i * $lanes).cast()) } };
                 }
-                let (mut right_lo, mut right_hi) = ([at!(lo, start - 1); 7], [at!(hi, start - 1); 7]);
-                for i in (0..start).rev() {
-                    let (mut a, mut b) = (at!(lo, i), at!(hi, i));
-                    grow!(P, shifts, $min, $permute, a, right_lo; 0 1 2 3 4 5);
-                    grow!(P, shifts, $max, $permute, b, right_hi; 0 1 2 3 4 5);
-                    let (least, most) = ($min(a, $permute(a, last, right_lo[P])), $max(b, $permute(b, last, right_hi[P])));
-                    (right_lo[P], right_hi[P]) = (a, b);
-                    if i < vectors {
-                        // SAFETY: as for reading.
-                        unsafe {
-                            _mm512_storeu_si512(out_lo.as_mut_ptr().add(i * $lanes).cast(), least);
-                            _mm512_storeu_si512(out_hi.as_mut_ptr().add(i * $lanes).cast(), most);
+                for k in 0..pitches.rows {
+                    let (lo, hi) = (&lo[k * pitches.from..], &hi[k * pitches.from..]);
+                    let (out_lo, out_hi) = (&mut out_lo[k * pitches.to..], &mut out_hi[k * pitches.to..]);
+                    let (mut right_lo, mut right_hi) = ([at!(lo, start - 1); 7], [at!(hi, start - 1); 7]);
+                    for i in (0..start).rev() {
+                        let (mut a, mut b) = (at!(lo, i), at!(hi, i));
+                        grow!(P, shifts, $min, $permute, a, right_lo; 0 1 2 3 4 5);
+                        grow!(P, shifts, $max, $permute, b, right_hi; 0 1 2 3 4 5);
+                        let least = $min(a, $permute(a, last, right_lo[P]));
+                        let most = $max(b, $permute(b, last, right_hi[P]));
+                        (right_lo[P], right_hi[P]) = (a, b);
+                        if i < vectors {
+                            // SAFETY: as for reading.
+                            unsafe {
+                                _mm512_storeu_si512(out_lo.as_mut_ptr().add(i * $lanes).cast(), least);
+                                _mm512_storeu_si512(out_hi.as_mut_ptr().add(i * $lanes).cast(), most);
+                            }
                         }
                     }
                 }
@@ -180,51 +202,94 @@ mod wide {
         f32, u32, 16, extremes_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
     }
 
+    /// Lane j of a part takes lane j + lane of a vector and its right neighbour.
+    const RAMP_32: [u32; 32] = {
+        let mut ramp = [0; 32];
+        let mut j = 0;
+        while j < 32 {
+            ramp[j] = j as u32;
+            j += 1;
+        }
+        ramp
+    };
+    const RAMP_64: [u64; 16] = {
+        let mut ramp = [0; 16];
+        let mut j = 0;
+        while j < 16 {
+            ramp[j] = j as u64;
+            j += 1;
+        }
+        ramp
+    };
+
     macro_rules! sums {
-        ($($t:ident, $lanes:literal, $name:ident, $add:ident, $sub:ident, $align:ident, $permute:ident, $set:ident, $($step:literal)*;)*) => {$(
+        ($($t:ident, $lanes:literal, $name:ident, $add:ident, $sub:ident, $align:ident, $permute:ident, $shift2:ident, $set:ident, $ramp:ident, $($step:literal)*;)*) => {$(
             impl RowSums for $t {
-                fn windows(level: Level, src: &[$t], w: usize, n: usize, out: &mut [$t], work: &mut [$t]) -> bool {
+                fn windows(
+                    level: Level,
+                    src: &[$t],
+                    w: usize,
+                    n: usize,
+                    out: &mut [$t],
+                    pitches: Pitches,
+                    work: &mut [$t],
+                ) -> bool {
                     if level != Level::Avx512 || w == 0 {
                         return false;
                     }
                     let len = (n + w - 1).next_multiple_of(64);
-                    assert!(len <= src.len() && len + 64 <= work.len() && n.next_multiple_of(64) <= out.len());
+                    let (from, to) = (pitches.rows.saturating_sub(1) * pitches.from, pitches.rows.saturating_sub(1) * pitches.to);
+                    assert!(from + len <= src.len() && len + 64 <= work.len() && to + n.next_multiple_of(64) <= out.len());
                     // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
-                    unsafe { $name(src, w, n, out, work) };
+                    unsafe { $name(src, w, n, out, pitches, work) };
                     true
                 }
             }
 
-            /// Running sums from 16 elements on in `work`, then their differences.
+            /// Sums before every element go to `work`; those to the ends of windows come from the newest two vectors.
             #[target_feature(enable = "avx512f")]
-            unsafe fn $name(src: &[$t], w: usize, n: usize, out: &mut [$t], work: &mut [$t]) {
-                const LEAD: usize = 16;
-                work[..LEAD].fill(0);
+            unsafe fn $name(src: &[$t], w: usize, n: usize, out: &mut [$t], pitches: Pitches, work: &mut [$t]) {
                 let (zero, top) = (_mm512_setzero_si512(), $set($lanes - 1));
-                let mut carry = zero;
-                for i in (0..n + w - 1).step_by($lanes) {
-                    // SAFETY: whole vectors below the length rounded up to 64.
-                    let mut p = unsafe { _mm512_loadu_si512(src.as_ptr().add(i).cast()) };
-                    $(p = $add(p, $align::<{ $lanes - $step }>(p, zero));)*
-                    let sum = $add(p, carry);
-                    carry = $add(carry, $permute(top, p));
-                    // SAFETY: as above, and `LEAD` more.
-                    unsafe { _mm512_storeu_si512(work.as_mut_ptr().add(LEAD + i).cast(), sum) };
-                }
-                for i in (0..n).step_by($lanes) {
-                    // SAFETY: as above; the last vector may read up to 64 elements beyond the sums.
-                    unsafe {
-                        let before = _mm512_loadu_si512(work.as_ptr().add(LEAD + i - 1).cast());
-                        let end = _mm512_loadu_si512(work.as_ptr().add(LEAD + i + w - 1).cast());
-                        _mm512_storeu_si512(out.as_mut_ptr().add(i).cast(), $sub(end, before));
+                // Vectors between a window's start and its last element, and the lane of that.
+                let (behind, lane) = ((w - 1) / $lanes, (w - 1) % $lanes);
+                // SAFETY: `lane` is less than a vector.
+                let shift = unsafe { _mm512_loadu_si512($ramp[lane..lane + $lanes].as_ptr().cast()) };
+                let vectors = n.div_ceil($lanes);
+                for k in 0..pitches.rows {
+                    let (src, out) = (&src[k * pitches.from..], &mut out[k * pitches.to..]);
+                    let (mut carry, mut last) = (zero, zero);
+                    // A window may end in the vector after the last that holds an element of it.
+                    for i in 0..vectors + behind + 1 {
+                        let v = if i * $lanes < n + w - 1 {
+                            // SAFETY: whole vectors below the length rounded up to 64.
+                            unsafe { _mm512_loadu_si512(src.as_ptr().add(i * $lanes).cast()) }
+                        } else {
+                            zero
+                        };
+                        let mut p = v;
+                        $(p = $add(p, $align::<{ $lanes - $step }>(p, zero));)*
+                        let sum = $add(p, carry);
+                        carry = $add(carry, $permute(top, p));
+                        // SAFETY: `work` has room for the vectors of all elements and one more.
+                        unsafe { _mm512_storeu_si512(work.as_mut_ptr().add(i * $lanes).cast(), $sub(sum, v)) };
+                        if i > behind {
+                            let at = (i - behind - 1) * $lanes;
+                            let end = $shift2(last, shift, sum);
+                            // SAFETY: written above; `at` is less than `n`.
+                            unsafe {
+                                let before = _mm512_loadu_si512(work.as_ptr().add(at).cast());
+                                _mm512_storeu_si512(out.as_mut_ptr().add(at).cast(), $sub(end, before));
+                            }
+                        }
+                        last = sum;
                     }
                 }
             }
         )*};
     }
     sums! {
-        u32, 16, sums_u32, _mm512_add_epi32, _mm512_sub_epi32, _mm512_alignr_epi32, _mm512_permutexvar_epi32, _mm512_set1_epi32, 1 2 4 8;
-        u64, 8, sums_u64, _mm512_add_epi64, _mm512_sub_epi64, _mm512_alignr_epi64, _mm512_permutexvar_epi64, _mm512_set1_epi64, 1 2 4;
+        u32, 16, sums_u32, _mm512_add_epi32, _mm512_sub_epi32, _mm512_alignr_epi32, _mm512_permutexvar_epi32, _mm512_permutex2var_epi32, _mm512_set1_epi32, RAMP_32, 1 2 4 8;
+        u64, 8, sums_u64, _mm512_add_epi64, _mm512_sub_epi64, _mm512_alignr_epi64, _mm512_permutexvar_epi64, _mm512_permutex2var_epi64, _mm512_set1_epi64, RAMP_64, 1 2 4;
     }
 }
 
@@ -241,13 +306,15 @@ mod tests {
         for level in Level::available() {
             for w in (1..=67).chain([127, 128]) {
                 for n in [1, 15, 63, 64, 65, 130, 256] {
-                    let (a, b) = (numbers(&of, roomy(n) + w), numbers(|i| of(i ^ 0x5a5a_5a5a), roomy(n) + w));
-                    let (mut lo, mut hi) = (vec![T::LEAST; roomy(n)], vec![T::LEAST; roomy(n)]);
-                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi) {
-                        for i in 0..n {
-                            let least = a[i..i + w].iter().fold(T::GREATEST, |m, v| m.lo(*v));
-                            let most = b[i..i + w].iter().fold(T::LEAST, |m, v| m.hi(*v));
-                            assert!(lo[i] == least && hi[i] == most, "{level:?} {w} {n} {i}");
+                    let (a, b) = (numbers(&of, roomy(n) + w + 7), numbers(|i| of(i ^ 0x5a5a_5a5a), roomy(n) + w + 7));
+                    let (mut lo, mut hi) = (vec![T::LEAST; 2 * roomy(n)], vec![T::LEAST; 2 * roomy(n)]);
+                    let pitches = Pitches { from: 7, to: roomy(n) - 5, rows: 2 };
+                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi, pitches) {
+                        for (k, i) in (0..2).flat_map(|k| (0..n).map(move |i| (k, i))) {
+                            let (from, to) = (k * pitches.from + i, k * pitches.to + i);
+                            let least = a[from..from + w].iter().fold(T::GREATEST, |m, v| m.lo(*v));
+                            let most = b[from..from + w].iter().fold(T::LEAST, |m, v| m.hi(*v));
+                            assert!(lo[to] == least && hi[to] == most, "{level:?} {w} {n} {k} {i}");
                         }
                     } else {
                         assert!(level < Level::Avx512 || w > 15);
@@ -271,14 +338,24 @@ mod tests {
             for w in [1, 2, 3, 8, 15, 16, 17, 21, 64, 129, 401] {
                 for n in [1, 63, 64, 65, 250] {
                     let len = usize::next_multiple_of(n + w - 1, 64);
-                    let (a, b) = (numbers(|i| i << 3, len), numbers(|i| (i as u64) << 33, len));
-                    let (mut s, mut t) = (vec![1; roomy(n)], vec![1; roomy(n)]);
-                    let done = <u32 as RowSums>::windows(level, &a, w, n, &mut s, &mut vec![7; len + 64]);
-                    assert_eq!(done, <u64 as RowSums>::windows(level, &b, w, n, &mut t, &mut vec![7; len + 64]));
-                    assert_eq!(done, level == Level::Avx512);
-                    for i in 0..n * done as usize {
-                        assert_eq!(s[i], a[i..i + w].iter().fold(0, |s: u32, v| s.wrapping_add(*v)), "{w} {n} {i}");
-                        assert_eq!(t[i], b[i..i + w].iter().fold(0, |s: u64, v| s.wrapping_add(*v)), "{w} {n} {i}");
+                    let (a, b) = (numbers(|i| i << 3, len + 7), numbers(|i| (i as u64) << 33, len + 7));
+                    let (mut s, mut t) = (vec![1; 2 * roomy(n)], vec![1; 2 * roomy(n)]);
+                    let pitches = Pitches { from: 7, to: roomy(n) - 5, rows: 2 };
+                    let done = <u32 as RowSums>::windows(level, &a, w, n, &mut s, pitches, &mut vec![7; len + 64]);
+                    let wide = <u64 as RowSums>::windows(level, &b, w, n, &mut t, pitches, &mut vec![7; len + 64]);
+                    assert!(done == wide && done == (level == Level::Avx512));
+                    for (k, i) in (0..2).flat_map(|k| (0..n * done as usize).map(move |i| (k, i))) {
+                        let (from, to) = (k * pitches.from + i, k * pitches.to + i);
+                        assert_eq!(
+                            s[to],
+                            a[from..from + w].iter().fold(0, |s: u32, v| s.wrapping_add(*v)),
+                            "{w} {n} {i}"
+                        );
+                        assert_eq!(
+                            t[to],
+                            b[from..from + w].iter().fold(0, |s: u64, v| s.wrapping_add(*v)),
+                            "{w} {n} {i}"
+                        );
                     }
                 }
             }

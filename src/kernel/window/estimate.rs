@@ -13,10 +13,12 @@ pub trait Acc: RowSums + Copy + Default + PartialOrd + std::fmt::Debug + 'static
     fn minus(self, o: Self) -> Self;
     fn wide(self) -> u128;
     fn low(self) -> u64;
+    /// Exact for values below 2^52.
+    fn small(self) -> f64;
 }
 
 macro_rules! acc {
-    ($($t:ident)*) => {$(
+    ($($t:ident: |$s:ident| $small:expr;)*) => {$(
         impl Acc for $t {
             #[inline(always)]
             fn plus(self, o: $t) -> $t { self.wrapping_add(o) }
@@ -26,10 +28,17 @@ macro_rules! acc {
             fn wide(self) -> u128 { self as u128 }
             #[inline(always)]
             fn low(self) -> u64 { self as u64 }
+            #[inline(always)]
+            fn small(self) -> f64 { let $s = self; $small }
         }
     )*};
 }
-acc!(u16 u32 u64 u128);
+acc! {
+    u16: |s| s as f64;
+    u32: |s| s as f64;
+    u64: |s| small(s);
+    u128: |s| small(s as u64);
+}
 impl RowSums for u16 {}
 
 /// The integer that first sums of a row end in: u32 or u64.
@@ -189,51 +198,80 @@ impl Width {
 }
 
 crate::multiversion! {
-    /// `out = n S2 - S1^2` of each window, exactly zero only for equal values.
+    /// Numerators of a row.
     pub fn numerator_row[X1: RowSum, X2: Acc](s1: &[X1], s2: &[X2], n: &[u32], width: Width, out: &mut [f64]) -> () = numerator_inner;
+}
+
+/// Runs `$body` for every window of a row with its numerator `n S2 - S1^2`, exactly zero only for equal values: one loop for
+/// each [`Width`]. A macro, as what is called for every value must be inlined.
+macro_rules! numerators {
+    ($s1:ident, $s2:ident, $n:ident, $width:expr, |$i:ident, $numerator:ident| $body:block) => {{
+        use $crate::kernel::window::estimate::{Width, numerator as by};
+        let len = $s1.len();
+        let (s2, n) = (&$s2[..len], &$n[..len]);
+        macro_rules! each {
+            ($of:ident) => {
+                for $i in 0..len {
+                    let $numerator = by::$of($s1[$i], s2[$i], n[$i]);
+                    $body
+                }
+            };
+        }
+        match $width {
+            Width::Small => each!(small),
+            Width::Direct => each!(direct),
+            Width::Centred => each!(centred),
+            Width::Big => each!(big),
+        }
+    }};
+}
+pub(super) use numerators;
+
+/// The numerator of one window by each [`Width`].
+pub mod numerator {
+    use super::{Acc, RowSum};
+
+    #[inline(always)]
+    fn fused(n: f64, s1: f64, s2: f64) -> f64 {
+        let p = s1 * s1;
+        let e = s1.mul_add(s1, -p);
+        n.mul_add(s2, -p) - e
+    }
+
+    #[inline(always)]
+    pub fn small<X1: RowSum, X2: Acc>(s1: X1, s2: X2, n: u32) -> f64 {
+        let a = s1.small();
+        (n as f64).mul_add(s2.small(), -(a * a))
+    }
+
+    #[inline(always)]
+    pub fn direct<X1: RowSum, X2: Acc>(s1: X1, s2: X2, n: u32) -> f64 {
+        fused(n as f64, s1.small(), s2.small())
+    }
+
+    #[inline(always)]
+    pub fn centred<X1: RowSum, X2: Acc>(s1: X1, s2: X2, n: u32) -> f64 {
+        let (a, m) = (s1.low(), n as u64);
+        let centred = s2.low().wrapping_sub(a << 16).wrapping_add(m << 30);
+        let m = m as f64;
+        fused(m, (-32768f64).mul_add(m, s1.small()), centred.small())
+    }
+
+    #[inline(always)]
+    pub fn big<X1: RowSum, X2: Acc>(s1: X1, s2: X2, n: u32) -> f64 {
+        let (a, m) = (s1.wide(), n as u128);
+        m.wrapping_mul(s2.wide()).wrapping_sub(a * a) as f64
+    }
 }
 
 #[inline(always)]
 fn numerator_inner<X1: RowSum, X2: Acc>(s1: &[X1], s2: &[X2], n: &[u32], width: Width, out: &mut [f64]) {
-    let len = out.len();
-    let (s1, s2, n) = (&s1[..len], &s2[..len], &n[..len]);
-    let fused = |n: f64, s1: f64, s2: f64| {
-        let p = s1 * s1;
-        let e = s1.mul_add(s1, -p);
-        n.mul_add(s2, -p) - e
-    };
-    match width {
-        Width::Small => {
-            for i in 0..len {
-                let a = small(s1[i].low());
-                out[i] = (n[i] as f64).mul_add(small(s2[i].low()), -(a * a));
-            }
-        }
-        Width::Direct => {
-            for i in 0..len {
-                out[i] = fused(n[i] as f64, small(s1[i].low()), small(s2[i].low()));
-            }
-        }
-        Width::Centred => {
-            for i in 0..len {
-                let (a, m) = (s1[i].low(), n[i] as u64);
-                let centred = s2[i].low().wrapping_sub(a << 16).wrapping_add(m << 30);
-                let m = m as f64;
-                out[i] = fused(m, (-32768f64).mul_add(m, small(a)), small(centred));
-            }
-        }
-        Width::Big => {
-            for i in 0..len {
-                let (a, m) = (s1[i].wide(), n[i] as u128);
-                out[i] = m.wrapping_mul(s2[i].wide()).wrapping_sub(a * a) as f64;
-            }
-        }
-    }
+    let s1 = &s1[..out.len()];
+    numerators!(s1, s2, n, width, |i, m| { out[i] = m });
 }
 
 crate::multiversion! {
-    /// Mean of the stored values (`code - offset`), f64; `exact` says that S1 < 2^52.
-    /// `inverse` holds the reciprocals of `n`.
+    /// Mean of the stored values (`code - offset`), f64; `exact` says that S1 < 2^52. `inverse` holds the reciprocals of `n`.
     pub fn mean_row[X1: RowSum](s1: &[X1], n: &[u32], inverse: &[f64], offset: f64, exact: bool, out: &mut [f64]) -> () = mean_inner;
 }
 
@@ -243,20 +281,32 @@ fn mean_inner<X1: RowSum>(s1: &[X1], n: &[u32], inverse: &[f64], offset: f64, ex
     let (s1, n, inverse) = (&s1[..len], &n[..len], &inverse[..len]);
     if exact {
         for i in 0..len {
-            let m = n[i] as f64;
-            let s = (-offset).mul_add(m, small(s1[i].low())); // an integer below 2^53: exact
-            // A quotient without a division: q is off by less than two units in the last place, and one step with the
-            // exact remainder rounds as the division does, since s / n lies at least 2^-32 units from any midpoint.
-            let q = s * inverse[i];
-            out[i] = (-q).mul_add(m, s).mul_add(inverse[i], q);
+            out[i] = exact_mean(s1[i], n[i], inverse[i], offset);
         }
     } else {
         for i in 0..len {
-            // Quotient and remainder: only the sum rounds, the fraction's own rounding lies 2^-53 below it.
-            let (s, m) = (s1[i].low(), n[i].max(1) as u64);
-            out[i] = ((s / m) as f64 - offset) + (s % m) as f64 / m as f64;
+            out[i] = long_mean(s1[i], n[i], offset);
         }
     }
+}
+
+/// The mean of a window where S1 < 2^52.
+#[inline(always)]
+pub fn exact_mean<X1: RowSum>(s1: X1, n: u32, inverse: f64, offset: f64) -> f64 {
+    let m = n as f64;
+    let s = (-offset).mul_add(m, s1.small()); // an integer below 2^53: exact
+    // A quotient without a division: q is off by less than two units in the last place, and one step with the
+    // exact remainder rounds as the division does, since s / n lies at least 2^-32 units from any midpoint.
+    let q = s * inverse;
+    (-q).mul_add(m, s).mul_add(inverse, q)
+}
+
+/// The mean of any window.
+#[inline(always)]
+pub fn long_mean<X1: RowSum>(s1: X1, n: u32, offset: f64) -> f64 {
+    // Quotient and remainder: only the sum rounds, the fraction's own rounding lies 2^-53 below it.
+    let (s, m) = (s1.low(), n.max(1) as u64);
+    ((s / m) as f64 - offset) + (s % m) as f64 / m as f64
 }
 
 /// What the estimators of openness share.
@@ -314,18 +364,6 @@ crate::multiversion! {
 fn quantise_inner(openness: &[f32], out: &mut [u8]) {
     for (o, v) in out.iter_mut().zip(openness) {
         *o = math::quantise(*v);
-    }
-}
-
-crate::multiversion! {
-    /// Variance from its numerator, within 2^-51 of itself; `inverse` holds the reciprocals of the counts.
-    pub fn variance_row[](numerator: &[f64], inverse: &[f64], out: &mut [f64]) -> () = variance_inner;
-}
-
-#[inline(always)]
-fn variance_inner(numerator: &[f64], inverse: &[f64], out: &mut [f64]) {
-    for ((o, m), n) in out.iter_mut().zip(numerator).zip(inverse) {
-        *o = m * n * n;
     }
 }
 

@@ -304,7 +304,7 @@ pub fn rows_extremes<T: Elem>(
         from,
         lines,
         w,
-        job.pitch,
+        job.columns(),
         plain,
         lo,
         hi,

@@ -42,7 +42,7 @@ pub fn finish_floats(
     assert!((0..3).all(|a| lo[a] + shape[a] <= dst[a]), "a part outside {dst:?}");
     let [nz, ny, nx] = shape;
     let mut bytes = cx.scratch.take(scratch_bytes(nx));
-    let mut emit = Emit::new(outs, params, cx.level, nx, &mut bytes);
+    let mut emit = Emit::new(outs, params, cx.level, [nx; 2], &mut bytes);
     let bytes = &mut bytes;
     let (least, greatest) = (cut::<f32>(bytes, nx), cut::<f32>(bytes, nx));
     let (sums, m2) = (cut::<f64>(bytes, nx), cut::<f64>(bytes, nx));
@@ -63,5 +63,5 @@ pub fn finish_floats(
 
 /// Bytes of scratch that [`finish_floats`] takes for rows of `width` voxels.
 pub fn scratch_bytes(width: usize) -> usize {
-    Emit::bytes(width) + 2 * padded::<f32>(width) + 2 * padded::<f64>(width)
+    Emit::bytes(width, width) + 2 * padded::<f32>(width) + 2 * padded::<f64>(width)
 }

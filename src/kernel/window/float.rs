@@ -10,7 +10,7 @@ use super::along::SLACK;
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
 use super::extremes::{blocked, deep_len, rows_extremes};
 use super::float_estimate::{self as est, Centre};
-use super::lines::{self, Coding, Elem, Masked, Sources};
+use super::lines::{self, Coding, Elem, Masked, Pitches, Sources};
 use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};
 use super::parts::{BLOCK, Weights};
@@ -40,7 +40,7 @@ impl Float for f64 {
 pub fn bytes<T: Float>(job: &Job) -> usize {
     let wanted = Wanted { pairs: T::Total::PAIR, variance: job.needs.variance, counts: true };
     let sums = if job.needs.mean { Buffers::<T::Total>::bytes(job, wanted) } else { 0 };
-    Emit::bytes(job.tile[1]) + padded::<T>(Lines::<T>::len(job)) + Extremes::<T>::bytes(job) + sums
+    Emit::bytes(job.tile[1], job.tile[1]) + padded::<T>(Lines::<T>::len(job)) + Extremes::<T>::bytes(job) + sums
 }
 
 /// The lines along z of one buffer row of a batch, side by side: planes lie a power of two apart in many volumes, and then
@@ -120,7 +120,7 @@ pub fn run<T: Float>(
     let counts = rows.into_iter().any(|(z, y)| any_nan(level, src.row_at(z, y)));
     let wanted = Wanted { pairs: T::Total::PAIR, variance: needs.variance, counts };
     let bytes = &mut &mut *bytes;
-    let mut emit = Emit::new(outs, params, level, job.tile[1], bytes);
+    let mut emit = Emit::new(outs, params, level, [job.tile[1]; 2], bytes);
     let mut lines = Lines::new(job, cut::<T>(bytes, Lines::<T>::len(job)));
     // Sums without counts take what does not exist as 0, others as missing.
     let nothing = T::from_f64(if counts { f64::NAN } else { 0.0 });
@@ -339,7 +339,8 @@ impl<'a, T: Float> Extremes<'a, T> {
         }
         let line = (j % job.rows) * job.pitch;
         let (lo, hi) = (&self.row_lo[line..], &self.row_hi[line..]);
-        lines::row_extremes(level, lo, hi, job.window[2], job.tile[1], self.out_lo, self.out_hi, self.work);
+        let pitches = Pitches { from: 0, to: 0, rows: 1 };
+        lines::row_extremes(level, lo, hi, job.window[2], job.tile[1], self.out_lo, self.out_hi, pitches, self.work);
     }
 }
 

@@ -5,11 +5,11 @@
 //! type by [`dispatch`], which checks the bounds.
 
 use super::along::SLACK;
-use super::emit::{Emit, IntRow};
+use super::emit::{Emit, IntRows};
 use super::estimate::{self, Acc, Code, RowSum, Width};
 use super::extremes::{blocked, deep_len, rows_extremes};
-use super::lines::{self, Add, Coding, Masked, Op, Sources};
-use super::plan::{Job, Plain, Stage, Tile, bits, cut, padded};
+use super::lines::{self, Add, Coding, Masked, Op, Pitches, Sources};
+use super::plan::{Job, Plain, ROWS, Stage, Tile, bits, cut, padded};
 use crate::grid::View;
 use crate::kernel::simd::Level;
 
@@ -109,10 +109,11 @@ macro_rules! dispatch {
 }
 dispatch!(u8 u16 u32);
 
-/// Buffers of one moment: a running plane over z, a running row over y, a row widened for x, its tree, its result.
+/// Buffers of one moment: a running plane over z; a running row over y and the rows made from it; those widened for x;
+/// the tree of one row; the results of all.
 struct Moment<'a, Z, Y, X> {
     plane: &'a mut [Z],
-    row: &'a mut [Y],
+    rows: &'a mut [Y],
     wide: &'a mut [X],
     work: &'a mut [X],
     out: &'a mut [X],
@@ -124,21 +125,27 @@ fn tree_len(job: &Job) -> usize {
 }
 
 impl<'a, Z: Plain, Y: Plain, X: Plain> Moment<'a, Z, Y, X> {
+    /// Elements of each buffer.
+    fn lens(job: &Job, wanted: bool) -> [usize; 5] {
+        let wide = if size_of::<Y>() == size_of::<X>() { 0 } else { ROWS * job.pitch };
+        let all = [job.plane(), (1 + ROWS) * job.pitch, wide, tree_len(job), ROWS * job.out_pitch()];
+        all.map(|len| wanted as usize * len)
+    }
+
     fn cut(job: &Job, wanted: bool, bytes: &mut &'a mut [u8]) -> Self {
-        let k = wanted as usize;
+        let [plane, rows, wide, work, out] = Self::lens(job, wanted);
         Moment {
-            plane: cut(bytes, k * job.plane()),
-            row: cut(bytes, k * job.pitch),
-            wide: cut(bytes, k * job.pitch),
-            work: cut(bytes, k * tree_len(job)),
-            out: cut(bytes, k * job.tile[1].next_multiple_of(64)),
+            plane: cut(bytes, plane),
+            rows: cut(bytes, rows),
+            wide: cut(bytes, wide),
+            work: cut(bytes, work),
+            out: cut(bytes, out),
         }
     }
 
     fn bytes(job: &Job, wanted: bool) -> usize {
-        let (z, y) = (padded::<Z>(job.plane()), padded::<Y>(job.pitch));
-        let x = padded::<X>(job.pitch) + padded::<X>(tree_len(job)) + padded::<X>(job.tile[1].next_multiple_of(64));
-        wanted as usize * (z + y + x)
+        let [plane, rows, wide, work, out] = Self::lens(job, wanted);
+        padded::<Z>(plane) + padded::<Y>(rows) + padded::<X>(wide) + padded::<X>(work) + padded::<X>(out)
     }
 }
 
@@ -149,16 +156,15 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
     let stage = padded::<T>(Stage::len(job, size_of::<T>()));
-    let rows = stage
-        + padded::<T>(2 * job.pitch)
-        + padded::<T>(deep_len(job))
-        + 2 * padded::<T>(job.tile[1].next_multiple_of(64));
+    let rows =
+        stage + padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(ROWS * job.out_pitch());
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
         + Moment::<u32, u32, u32>::bytes(job, masked)
-        + 2 * padded::<u32>(job.tile[1])
-        + padded::<f64>(job.tile[1])
+        + padded::<u32>(job.tile[1])
+        + padded::<u32>(ROWS * job.out_pitch())
+        + padded::<f64>(ROWS * job.out_pitch())
 }
 
 /// What becomes of a code in a running sum.
@@ -236,19 +242,48 @@ fn slide_inner<T: Code, Z: Acc + From<F::Out>, F: Term<T>, const M: bool>(
 }
 
 crate::multiversion! {
-    /// `run[i] += new[i] - old[i]`, and the same widened.
-    fn slide_rows[Z: Acc, Y: Acc + From<Z>](new: &[Z], old: &[Z], run: &mut [Y]) -> () = slide_rows_inner;
+    /// Adds a row to the running one.
+    fn add_row[Z: Acc, Y: Acc + From<Z>](new: &[Z], run: &mut [Y]) -> () = add_row_inner;
 }
 
 #[inline(always)]
-fn slide_rows_inner<Z: Acc, Y: Acc + From<Z>>(new: &[Z], old: &[Z], run: &mut [Y]) {
-    if old.is_empty() {
-        for (r, a) in run.iter_mut().zip(new) {
-            *r = r.plus(Y::from(*a));
-        }
-    } else {
-        for ((r, a), b) in run.iter_mut().zip(new).zip(old) {
-            *r = r.plus(Y::from(*a)).minus(Y::from(*b));
+fn add_row_inner<Z: Acc, Y: Acc + From<Z>>(new: &[Z], run: &mut [Y]) {
+    for (r, a) in run.iter_mut().zip(new) {
+        *r = r.plus(Y::from(*a));
+    }
+}
+
+crate::multiversion! {
+    /// Sums along y for `count` output rows from `first` on: each is the row before it with the last line of its window and
+    /// without the line before its window (there is none at 0). Row 0 of `rows` is the one before `first`.
+    fn slide_rows[Z: Acc, Y: Acc + From<Z>](
+        plane: &[Z], first: usize, w: usize, pitch: usize, columns: usize, count: usize, rows: &mut [Y]
+    ) -> () = slide_rows_inner;
+}
+
+#[inline(always)]
+fn slide_rows_inner<Z: Acc, Y: Acc + From<Z>>(
+    plane: &[Z],
+    first: usize,
+    w: usize,
+    pitch: usize,
+    columns: usize,
+    count: usize,
+    rows: &mut [Y],
+) {
+    for k in 0..count {
+        let (before, after) = rows.split_at_mut((k + 1) * pitch);
+        let (run, out) = (&before[k * pitch..][..columns], &mut after[..columns]);
+        let line = |y: usize| &plane[y * pitch..][..columns];
+        let new = line(first + k + w - 1);
+        if first + k == 0 {
+            for ((o, r), a) in out.iter_mut().zip(run).zip(new) {
+                *o = r.plus(Y::from(*a));
+            }
+        } else {
+            for (((o, r), a), b) in out.iter_mut().zip(run).zip(new).zip(line(first + k - 1)) {
+                *o = r.plus(Y::from(*a)).minus(Y::from(*b));
+            }
         }
     }
 }
@@ -270,26 +305,70 @@ where
 {
     /// Starts the running row with all but the last row of the first window.
     fn begin_rows(&mut self, level: Level, job: &Job) {
-        self.row.fill(Y::default());
+        let run = &mut self.rows[..job.pitch];
+        run.fill(Y::default());
         for y in 0..job.window[1] - 1 {
-            slide_rows(level, &self.plane[y * job.pitch..][..job.pitch], &[], self.row);
+            add_row(level, &self.plane[y * job.pitch..][..job.columns()], run);
         }
     }
 
-    /// Sums of the windows of output row `y` of the tile, left in `out`.
-    fn finish_row(&mut self, level: Level, job: &Job, y: usize) {
-        let line = |y: usize| &self.plane[y * job.pitch..][..job.pitch];
-        let old = if y == 0 { &[] } else { line(y - 1) };
-        slide_rows(level, line(y + job.window[1] - 1), old, self.row);
-        let (w, n) = (job.window[2], job.tile[1]);
-        let same = size_of::<Y>() == size_of::<X>();
-        if !same {
-            widen(level, self.row, self.wide);
+    /// Sums of the windows of `rows` output rows from `y` of the tile on, left in `out`.
+    fn finish_rows(&mut self, level: Level, job: &Job, y: usize, rows: usize) {
+        let (w, n, pitch) = (job.window[2], job.tile[1], job.pitch);
+        slide_rows(level, self.plane, y, job.window[1], pitch, job.columns(), rows, self.rows);
+        let made = &self.rows[pitch..][..rows * pitch];
+        let from = if self.wide.is_empty() {
+            bits::<X, Y>(made)
+        } else {
+            widen(level, made, self.wide);
+            &*self.wide
+        };
+        let pitches = Pitches { from: pitch, to: job.out_pitch(), rows };
+        if !X::windows(level, from, w, n, self.out, pitches, self.work) {
+            for k in 0..rows {
+                let to = &mut self.out[k * pitches.to..][..n];
+                lines::tree_sum(level, &from[k * pitch..][..pitch], w, 1, to, self.work);
+            }
         }
-        let from = if same { bits::<X, Y>(self.row) } else { &*self.wide };
-        if !X::windows(level, from, w, n, self.out, self.work) {
-            lines::tree_sum(level, from, w, 1, &mut self.out[..n], self.work);
+        self.rows.copy_within(rows * pitch..(rows + 1) * pitch, 0);
+    }
+}
+
+/// Voxels in the windows of a block of rows, and their reciprocals where they are wanted.
+struct Counts<'a> {
+    /// Voxels that exist along x for each column.
+    columns: &'a mut [u32],
+    n: &'a mut [u32],
+    inverse: &'a mut [f64],
+    /// The section of every row of the block that `n` was made for.
+    made: [usize; ROWS],
+}
+
+impl Counts<'_> {
+    fn begin_tile(&mut self, job: &Job, tile: &Tile) {
+        for (i, c) in self.columns[..tile.size[1]].iter_mut().enumerate() {
+            *c = job.count(2, tile.x + i) as u32;
         }
+        self.made = [0; ROWS];
+    }
+
+    /// For rows whose windows have a section of `section(k)` voxels; returns the elements from row to row, 0 where all rows
+    /// have the same counts, which then stay in the first-level cache.
+    fn make(&mut self, level: Level, job: &Job, rows: usize, divides: bool, section: impl Fn(usize) -> usize) -> usize {
+        let alike = (1..rows).all(|k| section(k) == section(0));
+        for k in 0..if alike { 1 } else { rows } {
+            let section = section(k);
+            if section == self.made[k] {
+                continue;
+            }
+            self.made[k] = section;
+            let part = k * job.out_pitch()..k * job.out_pitch() + job.tile[1];
+            self.n[part.clone()].iter_mut().zip(&*self.columns).for_each(|(n, c)| *n = section as u32 * c);
+            if divides {
+                estimate::inverse_row(level, &self.n[part.clone()], &mut self.inverse[part]);
+            }
+        }
+        if alike { 0 } else { job.out_pitch() }
     }
 }
 
@@ -319,24 +398,22 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let work = cut::<T>(bytes, k * 2 * job.pitch);
     let deep = cut::<T>(bytes, k * deep_len(job));
-    let out_lo = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
-    let out_hi = cut::<T>(bytes, k * job.tile[1].next_multiple_of(64));
+    let out_lo = cut::<T>(bytes, k * ROWS * job.out_pitch());
+    let out_hi = cut::<T>(bytes, k * ROWS * job.out_pitch());
     let stage = cut::<T>(bytes, k * Stage::len(job, size_of::<T>()));
     let mut s1 = Moment::<Z1, Y1, X1>::cut(job, needs.mean, bytes);
     let mut s2 = Moment::<Z2, Y2, X2>::cut(job, needs.variance, bytes);
     let mut count = Moment::<u32, u32, u32>::cut(job, M, bytes);
-    let n = cut::<u32>(bytes, job.tile[1]);
-    let columns = cut::<u32>(bytes, job.tile[1]);
-    let inverse = cut::<f64>(bytes, job.tile[1]);
+    let columns = cut(bytes, job.tile[1]);
+    let [n, inverse] = [(); 2].map(|()| ROWS * job.out_pitch());
+    let mut counts = Counts { columns, n: cut(bytes, n), inverse: cut(bytes, inverse), made: [0; ROWS] };
     let coding = Coding { flip, missing: missing.unwrap_or_default() };
     let plain = Coding { flip: T::default(), missing: T::default() };
     let (most, divides) = (job.counts().0, emit.divides());
     let width = Width::of(most, T::TOP);
     for tile in Tile::all(job) {
         let (y, x) = (tile.y, tile.x);
-        for (i, c) in columns[..tile.size[1]].iter_mut().enumerate() {
-            *c = job.count(2, x + i) as u32;
-        }
+        counts.begin_tile(job, &tile);
         lo.fill(T::GREATEST);
         hi.fill(T::LEAST);
         s1.plane.fill(Z1::default());
@@ -380,7 +457,6 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                 let old = (first + z).checked_sub(reach + 1);
                 slide_in(new, old, &mut s1, &mut s2, &mut count);
                 let section = job.count(0, z);
-                let mut rows_counted = 0;
                 if needs.mean {
                     s1.begin_rows(level, job);
                 }
@@ -391,52 +467,53 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                     count.begin_rows(level, job);
                 }
                 let plane = (z - z0) * job.plane();
-                for j in 0..tile.size[0] {
+                for j in (0..tile.size[0]).step_by(ROWS) {
+                    let rows = ROWS.min(tile.size[0] - j);
                     if needs.extremes {
                         if j % job.rows == 0 {
                             let from = [&lo[plane..plane + job.plane()], &hi[plane..plane + job.plane()]];
                             rows_extremes(level, job, from, j, plain, row_lo, row_hi, deep);
                         }
                         let line = (j % job.rows) * job.pitch;
-                        let w = job.window[2];
-                        let n = job.tile[1];
-                        lines::row_extremes(level, &row_lo[line..], &row_hi[line..], w, n, out_lo, out_hi, work);
+                        let (w, n) = (job.window[2], job.tile[1]);
+                        let pitches = Pitches { from: job.pitch, to: job.out_pitch(), rows };
+                        let from = [&row_lo[line..], &row_hi[line..]];
+                        lines::row_extremes(level, from[0], from[1], w, n, out_lo, out_hi, pitches, work);
                     }
                     if needs.mean {
-                        s1.finish_row(level, job, j);
+                        s1.finish_rows(level, job, j, rows);
                     }
                     if needs.variance {
-                        s2.finish_row(level, job, j);
+                        s2.finish_rows(level, job, j, rows);
                     }
-                    if M {
-                        count.finish_row(level, job, j);
+                    let n_pitch = if M {
+                        count.finish_rows(level, job, j, rows);
                         if divides {
-                            estimate::inverse_row(level, &count.out[..tile.size[1]], inverse);
+                            estimate::inverse_row(level, count.out, counts.inverse);
                         }
+                        job.out_pitch()
                     } else {
-                        let rows = job.count(1, y + j);
-                        if rows != rows_counted {
-                            let section = (section * rows) as u32;
-                            n[..tile.size[1]].iter_mut().zip(&*columns).for_each(|(n, c)| *n = section * c);
-                            if divides {
-                                estimate::inverse_row(level, &n[..tile.size[1]], inverse);
-                            }
-                            rows_counted = rows;
-                        }
-                    }
-                    let first = at[2] + x;
-                    let row = IntRow {
-                        v: &src.row_at(at[0] + z, at[1] + y + j)[first..first + tile.size[1]],
+                        counts.make(level, job, rows, divides, |k| section * job.count(1, y + j + k))
+                    };
+                    let [cz, cy] = [at[0] + z, at[1] + y + j];
+                    let first = cz * src.plane + cy * src.row + at[2] + x;
+                    let windows = IntRows {
+                        v: &src.data[first..first + (rows - 1) * src.row + tile.size[1]],
+                        v_pitch: src.row,
                         lo: out_lo,
                         hi: out_hi,
                         s1: s1.out,
                         s2: s2.out,
-                        n: if M { count.out } else { n },
-                        inverse,
+                        n: if M { count.out } else { counts.n },
+                        inverse: counts.inverse,
+                        n_pitch,
+                        pitch: job.out_pitch(),
+                        rows,
+                        len: tile.size[1],
                         most,
                         width,
                     };
-                    emit.int_row(setup, row, [z, y + j, x]);
+                    emit.int_rows(setup, windows, [z, y + j, x]);
                 }
             }
         }

@@ -215,7 +215,15 @@ pub fn tree_extreme<E: Elem, O: Op<E>>(
     join_at(level, op, if levels == 0 { src } else { &*b }, &offsets[..terms], out, false);
 }
 
-/// Extremes along x of a row, for `n` outputs of windows of `w`: in registers, or by the tree.
+/// Rows of a buffer and of their results: elements from one to the next, and how many there are.
+#[derive(Clone, Copy)]
+pub struct Pitches {
+    pub from: usize,
+    pub to: usize,
+    pub rows: usize,
+}
+
+/// Extremes along x of rows, for `n` outputs of windows of `w`: in registers, or by the tree.
 #[allow(clippy::too_many_arguments)]
 pub fn row_extremes<E: Elem>(
     level: crate::kernel::simd::Level,
@@ -225,11 +233,15 @@ pub fn row_extremes<E: Elem>(
     n: usize,
     out_lo: &mut [E],
     out_hi: &mut [E],
+    pitches: Pitches,
     work: &mut [E],
 ) {
-    if !E::windows(level, lo, hi, w, n, out_lo, out_hi) {
-        tree_extreme(level, Lo, &lo[..n + w - 1], w, 1, &mut out_lo[..n], work);
-        tree_extreme(level, Hi, &hi[..n + w - 1], w, 1, &mut out_hi[..n], work);
+    if !E::windows(level, lo, hi, w, n, out_lo, out_hi, pitches) {
+        for k in 0..pitches.rows {
+            let (from, to) = (k * pitches.from, k * pitches.to);
+            tree_extreme(level, Lo, &lo[from..][..n + w - 1], w, 1, &mut out_lo[to..][..n], work);
+            tree_extreme(level, Hi, &hi[from..][..n + w - 1], w, 1, &mut out_hi[to..][..n], work);
+        }
     }
 }
 

@@ -16,6 +16,7 @@ mod estimate;
 mod exact;
 mod extremes;
 mod far;
+mod finish;
 pub mod finish_floats;
 mod float;
 mod float_estimate;
@@ -122,7 +123,7 @@ pub fn scratch_bytes(dtype: DType, src: Shape, dst: Shape, params: &WindowParams
 }
 
 fn int_bytes<C: Dispatch>(job: &Job, masked: bool) -> usize {
-    Emit::bytes(job.tile[1]) + C::bytes(job, masked)
+    Emit::bytes(plan::ROWS * job.out_pitch(), job.tile[1]) + C::bytes(job, masked)
 }
 
 fn check(src: AnyView, params: &WindowParams, at: [usize; 3], dst: Shape, outs: &[WindowOut]) {
@@ -160,8 +161,8 @@ fn integers<S: Voxel + Plain, C: Dispatch>(
         (least..=most).contains(m)
     });
     let missing = missing.map(|m| code_of::<C>(m + flip.u32() as f64));
-    let mut bytes = cx.scratch.take(Emit::bytes(job.tile[1]) + C::bytes(&job, missing.is_some()));
-    let mut emit = Emit::new(outs, params, cx.level, job.tile[1], &mut bytes);
+    let mut bytes = cx.scratch.take(int_bytes::<C>(&job, missing.is_some()));
+    let mut emit = Emit::new(outs, params, cx.level, [plan::ROWS * job.out_pitch(), job.tile[1]], &mut bytes);
     let setup = int::Setup { job: &job, level: cx.level, flip, missing };
     let view = View { data: plan::bits::<C, S>(src.data), shape: src.shape, plane: src.plane, row: src.row };
     C::run(view, &setup, &mut emit, bytes);

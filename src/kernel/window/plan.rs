@@ -92,10 +92,10 @@ impl Job {
         let batch = planes * deep.min(dst[0].div_ceil(planes));
         let rows =
             (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
-        let tile = [even(dst[1], rows), width];
+        let tile = [even(dst[1], rows).next_multiple_of(ROWS).min(dst[1]), width];
         let height = tile[0] + 2 * radius[1];
         let row_block = block(window[1], tile[0]);
-        let rows = row_block * if window[1] < DEEP { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
+        let rows = if window[1] < DEEP { ROWS } else { row_block * 4.min(tile[0].div_ceil(row_block)) };
         let skip = [0; 3];
         Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
     }
@@ -109,7 +109,7 @@ impl Job {
         let pitch = odd_lines(width + 2 * radius[2]);
         // Groups along z are made anew by each batch.
         let batch = most[0].min(BLOCK * if window[0] < DEEP { 1 } else { 4 });
-        let rows = (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
+        let rows = (FLOAT_TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
         let tile = [most[1].min(rows.max(2 * radius[1]).next_multiple_of(BLOCK)), width];
         let height = tile[0] + 2 * radius[1];
         let (planes, row_block) = (block(window[0], batch), block(window[1], tile[0]));
@@ -144,22 +144,38 @@ impl Job {
         ((c + r + 1).min(self.src[a] as isize) - (c - r).max(0)).max(0) as usize
     }
 
+    /// Elements from row to row of finished windows.
+    pub fn out_pitch(&self) -> usize {
+        self.tile[1].next_multiple_of(64)
+    }
+
+    /// Columns of a tile with its halo, in whole vectors: what lies between them and the pitch is never read.
+    pub fn columns(&self) -> usize {
+        (self.tile[1] + self.window[2] - 1).next_multiple_of(32)
+    }
+
     /// Elements of a tile plane.
     pub fn plane(&self) -> usize {
         self.height * self.pitch
     }
 }
 
+/// Output rows of integers that go through x and the estimators together, so that few calls are made: a multiple of every
+/// block.
+pub const ROWS: usize = 8;
 /// Widest tile in x.
 const MAX_WIDTH: usize = 512;
 /// The same for floats, whose planes hold sums of 8 and 16 bytes.
 const FLOAT_WIDTH: usize = 256;
 /// Fewest rows of a tile (if there are as many).
 const MIN_ROWS: usize = 32;
-/// Bytes of batch planes to aim at: they and the raw planes share a 1 MiB L2. 2-core Zen 4 VM, AVX-512, 2026-11-23, busy
-/// machine, cdf_power r=10 in ns/voxel (u8, u16, f32): 3.2, 4.4, 11.7 with 640 KiB; 3.6, 4.6, 12.2 with 200 kB; 3.2, 4.6,
+/// Bytes of batch planes to aim at. They share a 1 MiB L2 with the raw planes, but low tiles make many rows twice, and what
+/// spills is read in order. 2-core Zen 4 VM, AVX-512, 2026-11-27, r=10, ns/voxel with 640 KiB, 1280 KiB and 2 MiB:
+/// cdf_power u16 2.11, 1.98, 1.99; chebyshev u16 1.99, 1.84, 1.87; four moments u8 2.65, 2.50, 2.57.
+const TILE_BYTES: usize = 1280 << 10;
+/// The same for floats: 2-core Zen 4 VM, AVX-512, 2026-11-23, busy machine, cdf_power f32 11.7 with 640 KiB, 12.2 with 200 kB,
 /// 13.2 with 1.3 MB.
-const TILE_BYTES: usize = 640 << 10;
+const FLOAT_TILE_BYTES: usize = 640 << 10;
 
 /// Parts as even as can be of at most `most`.
 fn even(n: usize, most: usize) -> usize {

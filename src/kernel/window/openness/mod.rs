@@ -1,6 +1,7 @@
 //! Openness of rows of integer windows, 32 at a time: the arithmetic of [`super::math`] on vectors.
 
 use super::estimate::{Code, RowSum};
+use super::math;
 use crate::kernel::singles::{F32x32, SINGLES};
 
 /// Runs `$body` for starts of blocks of 32 that cover `0..len`, at least 32 values; the last may overlap its neighbour, and
@@ -23,18 +24,89 @@ mod spread;
 #[cfg(test)]
 mod tests;
 
-pub use power::cdf_power_row;
-pub use spread::spread_row;
+pub use power::cdf_power_rows;
+pub use spread::{Squares, spread_rows};
 
-/// Codes of the centres (before `flip`), and their windows. All slices are of one length.
+/// Windows of consecutive rows: row `k` of the centres (codes before `flip`) starts at `k * v_pitch`, of the counts `n` at
+/// `k * n_pitch`, of everything else at `k * pitch`.
+#[derive(Clone, Copy)]
+pub struct Rows<'a, T, X1> {
+    pub v: &'a [T],
+    pub v_pitch: usize,
+    pub flip: T,
+    pub s1: &'a [X1],
+    pub n: &'a [u32],
+    pub n_pitch: usize,
+    pub pitch: usize,
+    /// Most voxels in a window.
+    pub most: u64,
+    pub rows: usize,
+    /// Voxels of a row.
+    pub len: usize,
+}
+
+/// One of them. All slices are of one length.
 #[derive(Clone, Copy)]
 pub struct Row<'a, T, X1> {
     pub v: &'a [T],
     pub flip: T,
     pub s1: &'a [X1],
     pub n: &'a [u32],
-    /// Most voxels in a window.
-    pub most: u64,
+}
+
+/// Where rows go: row `k` starts at `k * pitch`.
+pub struct Target<'a, O> {
+    pub data: &'a mut [O],
+    pub pitch: usize,
+}
+
+/// Types that openness is written as.
+pub trait Openness: Copy + Default {
+    /// Estimators may err by up to 1.8e-4.
+    const COARSE: bool;
+    fn of(openness: f32) -> Self;
+    /// # Safety
+    /// 32 values can be written there.
+    unsafe fn put<L: F32x32>(openness: L, to: *mut Self);
+}
+impl Openness for f32 {
+    const COARSE: bool = false;
+    fn of(openness: f32) -> f32 {
+        openness
+    }
+    #[inline(always)]
+    unsafe fn put<L: F32x32>(openness: L, to: *mut f32) {
+        // SAFETY: the caller's promise.
+        unsafe { openness.store(to) }
+    }
+}
+/// 2^23: a sum with it holds the other number, rounded half even, in its low bits.
+const ROUNDED: f32 = 8_388_608.0;
+
+/// Round half even of 255 times it.
+impl Openness for u8 {
+    const COARSE: bool = true;
+    fn of(openness: f32) -> u8 {
+        math::quantise(openness)
+    }
+    #[inline(always)]
+    unsafe fn put<L: F32x32>(openness: L, to: *mut u8) {
+        // SAFETY: the caller's promise.
+        unsafe { openness.fused(L::splat(255.0), L::splat(ROUNDED)).store_codes(to) }
+    }
+}
+
+impl<'a, T: Code, X1: RowSum> Rows<'a, T, X1> {
+    #[inline(always)]
+    fn row(&self, k: usize) -> Row<'a, T, X1> {
+        let (s1, n) = (&self.s1[k * self.pitch..][..self.len], &self.n[k * self.n_pitch..][..self.len]);
+        Row { v: &self.v[k * self.v_pitch..][..self.len], flip: self.flip, s1, n }
+    }
+
+    /// Products of a count and a code, and so all differences of such products and sums, fit in i32.
+    fn narrow(&self) -> bool {
+        T::TOP <= u16::MAX as u32 && size_of::<X1>() == 4 && (self.most as u128 * T::TOP as u128) < 1 << 31
+    }
 }
 
 impl<T: Code, X1: RowSum> Row<'_, T, X1> {
@@ -42,11 +114,21 @@ impl<T: Code, X1: RowSum> Row<'_, T, X1> {
     fn part(&self, from: usize, to: usize) -> Self {
         Row { v: &self.v[from..to], s1: &self.s1[from..to], n: &self.n[from..to], ..*self }
     }
+}
 
-    /// Products of a count and a code, and so all differences of such products and sums, fit in i32.
-    fn narrow(&self) -> bool {
-        T::TOP <= u16::MAX as u32 && size_of::<X1>() == 4 && (self.most as u128 * T::TOP as u128) < 1 << 31
-    }
+/// Row `k`, of less than a block, as the first values of a row of a block, through `of`.
+fn one_padded<T: Code, X1: RowSum, O: Openness>(
+    rows: &Rows<T, X1>,
+    k: usize,
+    out: &mut Target<O>,
+    of: impl Fn(&Rows<T, X1>, &mut Target<O>),
+) {
+    let (row, len) = (rows.row(k), rows.len);
+    let (v, s1, n) = (padded(row.v, len), padded(row.s1, len), padded(row.n, len));
+    let (mut all, pitch) = ([O::default(); SINGLES], SINGLES);
+    let block = Rows { v: &v, v_pitch: pitch, s1: &s1, n: &n, n_pitch: pitch, pitch, rows: 1, len: SINGLES, ..*rows };
+    of(&block, &mut Target { data: &mut all, pitch });
+    out.data[k * out.pitch..][..len].copy_from_slice(&all[..len]);
 }
 
 /// The first `len` values and the last of them again.

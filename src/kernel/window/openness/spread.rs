@@ -1,47 +1,54 @@
 //! The normal distribution (A 3.3) and Chebyshev's bounds (E 3.4) from mean and variance.
 
-use super::{Row, exp2, padded};
+use super::{Openness, Row, Rows, Target, exp2, padded};
 use crate::kernel::simd::Level;
 use crate::kernel::singles::{F32x32, SINGLES};
-use crate::kernel::window::estimate::{Code, Polarity, RowSum, Spread};
+use crate::kernel::window::estimate::{Acc, Code, Polarity, RowSum, Spread, Width, numerators};
 
 crate::on_singles! {
-    /// A 3.3 and E 3.4 from the numerators of variances.
-    fn spread_at[T: Code, X1: RowSum, const KIND: usize, const NARROW: bool](
-        row: &Row<T, X1>, numerator: &[f64], polarity: Polarity, scale: f32, out: &mut [f32]
-    ) = spread_inner[T, X1, KIND, NARROW];
+    /// A 3.3 and E 3.4 from sums of values and of squares.
+    fn spread_at[T: Code, X1: RowSum, X2: Acc, O: Openness, const KIND: usize, const NARROW: bool](
+        rows: &Rows<T, X1>, squares: &Squares<X2>, polarity: Polarity, scale: f32, out: &mut Target<O>
+    ) = spread_inner[T, X1, X2, O, KIND, NARROW];
 }
 
 const GAUSSIAN: usize = 0;
 const CHEBYSHEV: usize = 1;
 const LITERAL: usize = 2;
 
-/// A 3.3 and E 3.4 of a row with numerators `n^2 variance`.
-pub fn spread_row<T: Code, X1: RowSum>(
+/// Sums of squares of the windows of [`Rows`], and how exact numerators are made of them.
+#[derive(Clone, Copy)]
+pub struct Squares<'a, X2> {
+    pub s2: &'a [X2],
+    pub width: Width,
+}
+
+/// A 3.3 and E 3.4 of rows.
+pub fn spread_rows<T: Code, X1: RowSum, X2: Acc, O: Openness>(
     level: Level,
     kind: Spread,
-    row: &Row<T, X1>,
-    numerator: &[f64],
+    rows: &Rows<T, X1>,
+    squares: &Squares<X2>,
     polarity: Polarity,
-    out: &mut [f32],
+    out: &mut Target<O>,
 ) {
-    let len = out.len();
-    if len < SINGLES {
-        let (v, s1, n) = (padded(row.v, len), padded(row.s1, len), padded(row.n, len));
-        let mut all = [0.0; SINGLES];
-        let row = Row { v: &v, s1: &s1, n: &n, ..*row };
-        spread_row(level, kind, &row, &padded(numerator, len), polarity, &mut all);
-        out.copy_from_slice(&all[..len]);
+    if rows.len < SINGLES {
+        for k in 0..rows.rows {
+            let s2 = &padded(&squares.s2[k * rows.pitch..], rows.len);
+            let squares = Squares { s2, ..*squares };
+            let one = |rows: &Rows<T, X1>, out: &mut Target<O>| spread_rows(level, kind, rows, &squares, polarity, out);
+            super::one_padded(rows, k, out, one);
+        }
         return;
     }
     // Products of three deviations must stay below 2^128; a power of two changes no rounding.
-    let bits = (row.most as u128 * T::TOP as u128).max(1).ilog2() as i32;
+    let bits = (rows.most as u128 * T::TOP as u128).max(1).ilog2() as i32;
     let scale = 2f32.powi(-(bits - 38).max(0));
     macro_rules! go {
         ($kind:ident) => {
-            match row.narrow() {
-                true => spread_at::<T, X1, $kind, true>(level, row, numerator, polarity, scale, out),
-                false => spread_at::<T, X1, $kind, false>(level, row, numerator, polarity, scale, out),
+            match rows.narrow() {
+                true => spread_at::<T, X1, X2, O, $kind, true>(level, rows, squares, polarity, scale, out),
+                false => spread_at::<T, X1, X2, O, $kind, false>(level, rows, squares, polarity, scale, out),
             }
         };
     }
@@ -52,13 +59,45 @@ pub fn spread_row<T: Code, X1: RowSum>(
     }
 }
 
+/// Numerators `n^2 variance`, rounded to f32, that are made together and stay in the first-level cache.
+const STRIP: usize = 256;
+
 #[inline(always)]
-fn spread_inner<L: F32x32, T: Code, X1: RowSum, const KIND: usize, const NARROW: bool>(
-    row: &Row<T, X1>,
-    numerator: &[f64],
+fn spread_inner<L: F32x32, T: Code, X1: RowSum, X2: Acc, O: Openness, const KIND: usize, const NARROW: bool>(
+    rows: &Rows<T, X1>,
+    squares: &Squares<X2>,
     polarity: Polarity,
     scale: f32,
-    out: &mut [f32],
+    out: &mut Target<O>,
+) {
+    let mut strip = [0f32; STRIP];
+    assert!(rows.len >= SINGLES);
+    for k in 0..rows.rows {
+        let (row, s2) = (rows.row(k), &squares.s2[k * rows.pitch..][..rows.len]);
+        let out = &mut out.data[k * out.pitch..][..rows.len];
+        let mut from = 0;
+        loop {
+            let to = rows.len.min(from + STRIP);
+            let (part, numerator) = (row.part(from, to), &mut strip[..to - from]);
+            let (s1, s2, n) = (part.s1, &s2[from..to], part.n);
+            numerators!(s1, s2, n, squares.width, |i, m| { numerator[i] = m as f32 });
+            spread::<L, T, X1, O, KIND, NARROW>(&part, numerator, polarity, scale, &mut out[from..to]);
+            if to == rows.len {
+                break;
+            }
+            // A last strip of less than a block starts earlier, and makes some values again.
+            from = to.min(rows.len - SINGLES);
+        }
+    }
+}
+
+#[inline(always)]
+fn spread<L: F32x32, T: Code, X1: RowSum, O: Openness, const KIND: usize, const NARROW: bool>(
+    row: &Row<T, X1>,
+    numerator: &[f32],
+    polarity: Polarity,
+    scale: f32,
+    out: &mut [O],
 ) {
     let len = out.len();
     let (v, s1, n, numerator) = (&row.v[..len], &row.s1[..len], &row.n[..len], &numerator[..len]);
@@ -82,7 +121,7 @@ fn spread_inner<L: F32x32, T: Code, X1: RowSum, const KIND: usize, const NARROW:
             }
         };
         // SAFETY: as above.
-        let m = unsafe { L::of_f64(numerator.as_ptr().add(at)) };
+        let m = unsafe { L::load(numerator.as_ptr().add(at)) };
         let flat = m.equals(zero);
         let (d, m) = (d.times(sign), m.times(L::splat(scale * scale)));
         let constant = L::splat(polarity.constant);
@@ -98,7 +137,7 @@ fn spread_inner<L: F32x32, T: Code, X1: RowSum, const KIND: usize, const NARROW:
             L::pick(flat, constant, y)
         };
         // SAFETY: as above.
-        unsafe { y.store(out.as_mut_ptr().add(at)) };
+        unsafe { O::put(y, out.as_mut_ptr().add(at)) };
     });
 }
 
