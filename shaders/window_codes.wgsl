@@ -152,9 +152,10 @@ fn of_difference(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     return of_integer(minus64(a, b));
 }
 
-// The f32 nearest to d / n, half to even, of a count n below 2^28 and an integer d below 2^16 n: from a quotient in f32 that is a few units in the last place off, which the rest puts right. The rest is small, so
-// its low word is all of it. Rounding to f64 first would change nothing, since between a quotient of such a count and a number
-// halfway between two f32 lie more than 2^-53 of it.
+// The f32 nearest to d / n, half to even, of a count n below 2^27 and an integer d below 2^16 n: from a quotient in f32 that is a
+// few units in the last place off, which the rest puts right. The rest is small (at most 10 n), so its low word is all of it.
+// Rounding to f64 first would change nothing, since between a quotient of such a count and a number halfway between two f32 lie
+// more than 2^-53 of it.
 fn nearest(d: vec2<u32>, n: u32) -> u32 {
     if (d.x | d.y) == 0u {
         return 0u;
@@ -262,7 +263,7 @@ fn extreme(code: u32) -> u32 {
 }
 
 fn is_plain(w: Window) -> bool {
-    return p.scaled == 0u && w.n < 0x10000000u;
+    return p.scaled == 0u && w.n < 0x8000000u;
 }
 
 fn result(w: Window, channel: u32) -> u32 {

@@ -14,7 +14,7 @@ pub const MOST: usize = 16;
 /// Rows of voxels of a thread; the shader's `STRIP`.
 const STRIP: usize = 8;
 /// Voxels of windows from which on means go through f64; the shader's `is_plain`.
-const NEAREST: u64 = 1 << 28;
+const NEAREST: u64 = 1 << 27;
 
 /// What the dispatch does; `struct Finish` of `shaders/window_finish.wgsl`, which explains the fields.
 #[repr(C)]
