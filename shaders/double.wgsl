@@ -154,8 +154,9 @@ fn quotient_of(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     if y.bits.x == 0u && y.bits.y == SIGN {
         return joined(sign, x.exponent - y.exponent - 63, x.bits); // a power of two, as most counts are
     }
-    // Both have at most 53 bits. A bit, then three digits of 18 bits, each guessed in f32 as in `digit` of integers64.wgsl. What is
-    // left is less than the divisor, so that it does not matter that products lose what is above 64 bits.
+    // Both have at most 53 bits. A bit, then three digits of 18 bits, each guessed in f32, which is off by less
+    // than one as long as a quotient there is good to 2^-20, and put right. What is left is less than the divisor, so that it does
+    // not matter that products lose what is above 64 bits.
     let divisor = right64(y.bits, 11u);
     let inverse = 262144.0 / (f32(divisor.y) * 4294967296.0 + f32(divisor.x));
     var rest = right64(x.bits, 11u);

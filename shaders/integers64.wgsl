@@ -72,34 +72,6 @@ fn times64(a: vec2<u32>, b: vec2<u32>) -> vec4<u32> {
     return vec4<u32>(low.x, both.x, top.x, top.y);
 }
 
-// The whole part of u / d, and what is left, where u < d 2^32 and the top bit of d is set: two digits of 16 bits, each guessed in
-// f32, which is off by less than one as long as a reciprocal is good to 2^-18, and put right.
-struct Divided {
-    quotient: u32,
-    rest: u32,
-}
-
-fn digit(u: vec2<u32>, d: u32, inverse: f32) -> Divided {
-    var q = u32(min((f32(u.y) * 65536.0 + f32(u.x >> 16u)) * inverse, 65535.0));
-    var rest = minus64(vec2<u32>((u.y << 16u) | (u.x >> 16u), u.y >> 16u), times32(q, d));
-    if (rest.y & 0x80000000u) != 0u {
-        q -= 1u;
-        rest = plus64(rest, vec2<u32>(d, 0u));
-    }
-    if !less64(rest, vec2<u32>(d, 0u)) {
-        q += 1u;
-        rest = minus64(rest, vec2<u32>(d, 0u));
-    }
-    return Divided(q, rest.x);
-}
-
-fn divided(u: vec2<u32>, d: u32) -> Divided {
-    let inverse = 1.0 / f32(d);
-    let high = digit(u, d, inverse);
-    let low = digit(vec2<u32>(u.x << 16u, high.rest), d, inverse);
-    return Divided((high.quotient << 16u) | low.quotient, low.rest);
-}
-
 fn minus128(a: vec4<u32>, b: vec4<u32>) -> vec4<u32> {
     let low = minus64(a.xy, b.xy);
     let borrow = vec2<u32>(select(0u, 1u, less64(a.xy, b.xy)), 0u);

@@ -133,6 +133,27 @@ fn no_helper_is_written_twice() {
 }
 
 #[test]
+fn every_helper_is_called() {
+    let files = Shader::ALL.iter().flat_map(|s| s.files()).collect::<std::collections::BTreeSet<_>>();
+    let read = |file: &&&str| {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("shaders/{file}.wgsl"));
+        let text = fs::read_to_string(path).unwrap();
+        let code: Vec<&str> = text.lines().map(|l| l.split("//").next().unwrap_or_default()).collect();
+        code.join("\n")
+    };
+    let all: Vec<String> = files.iter().map(read).collect();
+    // Entry points stand behind their attribute, and are called by nobody.
+    let helpers = all.iter().flat_map(|text| text.split("\n\nfn ").skip(1)).filter_map(|f| f.split('(').next());
+    let called = |name: &str| {
+        let call = format!("{name}(");
+        let own = |before: &str| before.ends_with("fn ") || before.ends_with(|c: char| c.is_alphanumeric() || c == '_');
+        all.iter().any(|text| text.match_indices(&call).any(|(at, _)| !own(&text[..at])))
+    };
+    let dead: Vec<&str> = helpers.filter(|name| !called(name)).collect();
+    assert!(dead.is_empty(), "{dead:?}");
+}
+
+#[test]
 fn a_broken_shader_is_noticed() {
     assert!(check("fn f() -> u32 { return 1.5; }").is_err());
     assert!(check("@compute @workgroup_size(64) fn first() { missing[0] = 1u; }").is_err());

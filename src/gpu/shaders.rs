@@ -16,6 +16,20 @@ macro_rules! composed {
     };
 }
 
+/// Running sums of windows, of the type of a file.
+macro_rules! sums {
+    ($own:literal) => {
+        composed!("common", "entries", "window_pass", "window_sums", "window_tiles", "window_sums_rows", $own)
+    };
+}
+
+/// Van Herk over windows, of cells that a file keeps, with what else it needs.
+macro_rules! herk {
+    ($($more:literal),*; $own:literal) => {
+        composed!("common", $($more,)* "entries", "window_pass", "window_herk", "window_tiles", "window_herk_rows", $own)
+    };
+}
+
 /// The shaders, each with its text and entry points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Shader {
@@ -71,65 +85,15 @@ impl Shader {
 
     fn composed(self) -> Composed {
         match self {
-            Shader::Extremes => {
-                composed!(
-                    "common",
-                    "entries",
-                    "window_pass",
-                    "window_herk",
-                    "window_kept",
-                    "window_tiles",
-                    "window_herk_rows",
-                    "window_extremes"
-                )
-            }
-            Shader::Sums32 => composed!(
-                "common",
-                "entries",
-                "window_pass",
-                "window_sums",
-                "window_tiles",
-                "window_sums_rows",
-                "window_sums32"
-            ),
-            Shader::Sums64 => composed!(
-                "common",
-                "entries",
-                "window_pass",
-                "window_sums",
-                "window_tiles",
-                "window_sums_rows",
-                "window_sums64"
-            ),
+            Shader::Extremes => herk!("window_kept"; "window_extremes"),
+            Shader::Sums32 => sums!("window_sums32"),
+            Shader::Sums64 => sums!("window_sums64"),
             Shader::Obscurance => composed!("common", "obscurance_narrow", "obscurance"),
             Shader::ObscuranceWide => composed!("common", "obscurance_wide", "obscurance"),
             Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian"),
             Shader::Gradient => composed!("common", "gradient"),
-            Shader::Order => {
-                composed!(
-                    "common",
-                    "entries",
-                    "window_pass",
-                    "window_herk",
-                    "window_kept",
-                    "window_tiles",
-                    "window_herk_rows",
-                    "window_order"
-                )
-            }
-            Shader::Moments => {
-                composed!(
-                    "common",
-                    "floats",
-                    "pairs",
-                    "entries",
-                    "window_pass",
-                    "window_herk",
-                    "window_tiles",
-                    "window_herk_rows",
-                    "window_moments"
-                )
-            }
+            Shader::Order => herk!("window_kept"; "window_order"),
+            Shader::Moments => herk!("floats", "pairs"; "window_moments"),
             Shader::GaussianVariance => {
                 composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian_variance")
             }

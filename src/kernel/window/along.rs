@@ -203,24 +203,21 @@ mod wide {
     }
 
     /// Lane j of a part takes lane j + lane of a vector and its right neighbour.
-    const RAMP_32: [u32; 32] = {
-        let mut ramp = [0; 32];
-        let mut j = 0;
-        while j < 32 {
-            ramp[j] = j as u32;
-            j += 1;
-        }
-        ramp
-    };
-    const RAMP_64: [u64; 16] = {
-        let mut ramp = [0; 16];
-        let mut j = 0;
-        while j < 16 {
-            ramp[j] = j as u64;
-            j += 1;
-        }
-        ramp
-    };
+    macro_rules! ramp {
+        ($name:ident, $t:ident, $n:literal) => {
+            const $name: [$t; $n] = {
+                let mut ramp = [0; $n];
+                let mut j = 0;
+                while j < $n {
+                    ramp[j] = j as $t;
+                    j += 1;
+                }
+                ramp
+            };
+        };
+    }
+    ramp!(RAMP_32, u32, 32);
+    ramp!(RAMP_64, u64, 16);
 
     macro_rules! sums {
         ($($t:ident, $lanes:literal, $name:ident, $add:ident, $sub:ident, $align:ident, $permute:ident, $shift2:ident, $set:ident, $ramp:ident, $($step:literal)*;)*) => {$(
