@@ -4,6 +4,7 @@
 mod common_sources;
 
 use std::fs;
+use std::io::Read;
 use std::path::Path;
 
 use common_sources::*;
@@ -12,6 +13,7 @@ use occlude::config::{Input, InputKind, RawFormat, Select};
 use occlude::grid::{DType, Region};
 use occlude::store::Source;
 use occlude::store::source::ChunkRead;
+use serde_json::json;
 
 #[test]
 fn nifti_of_each_type_and_byte_order() {
@@ -153,6 +155,64 @@ fn zarr_v3_shards_missing_chunks_and_v2_orders() {
     assert!(matches!(source.read_chunk(0, [0, 0, 1], &mut chunk).unwrap(), ChunkRead::Missing(v) if v.is_nan()));
     assert_eq!(check(&fixture("zarr/v2be"), 0, 0).info().dtype, DType::I16);
     assert_eq!(check(&fixture("zarr/v2f"), 0, 0).info().dtype, DType::F64);
+}
+
+/// Arrays of version 2 in the packings of numcodecs, one chunk each, and with a checksum between voxels and packing.
+#[test]
+fn zarr_v2_codecs_of_numcodecs() {
+    type Pack = fn(&[u8]) -> Vec<u8>;
+    let bz2: Pack = |bytes| {
+        let mut out = Vec::new();
+        bzip2::read::BzEncoder::new(bytes, bzip2::Compression::fast()).read_to_end(&mut out).unwrap();
+        out
+    };
+    let lz4: Pack = lz4_flex::block::compress_prepend_size;
+    // Fletcher's sum as HDF5 has it: words of 16 bits, high byte first.
+    let summed: Pack = |bytes| {
+        let (mut a, mut b) = (0u32, 0u32);
+        for word in bytes.as_chunks::<2>().0 {
+            a = (a + u16::from_be_bytes(*word) as u32) % 65535;
+            b = (b + a) % 65535;
+        }
+        gzip(&[bytes, &(b << 16 | a).to_le_bytes()].concat())
+    };
+    let none = json!(null);
+    let cases: [(&str, serde_json::Value, Pack); 4] = [
+        ("bz2", none.clone(), bz2),
+        ("lz4", none.clone(), lz4),
+        ("gzip", none, gzip),
+        ("gzip", json!([{ "id": "fletcher32" }]), summed),
+    ];
+    let voxels: Vec<u8> = (0..120).map(expected([4, 5, 6], 0)).flat_map(|v| (v as u16).to_le_bytes()).collect();
+    for (id, filters, pack) in cases {
+        let folder = tempfile::tempdir().unwrap();
+        let meta = json!({
+            "zarr_format": 2, "shape": [4, 5, 6], "chunks": [4, 5, 6], "dtype": "<u2", "order": "C", "fill_value": 0,
+            "filters": filters, "compressor": { "id": id },
+        });
+        fs::write(folder.path().join(".zarray"), meta.to_string()).unwrap();
+        fs::write(folder.path().join("0.0.0"), pack(&voxels)).unwrap();
+        let input = file_input(folder.path());
+        let source = check(&input, 0, 0);
+        assert!(source.info().format.contains(id), "{}", source.info().format);
+        let packed = pack(&voxels);
+        fs::write(folder.path().join("0.0.0"), &packed[..packed.len() - 9]).unwrap();
+        let e = whole(&input, 0).unwrap_err().to_string();
+        assert!(e.contains("chunk [0, 0, 0] cannot be decoded"), "{id}: {e}");
+    }
+}
+
+#[test]
+fn nrrd_in_bzip2() {
+    let folder = tempfile::tempdir().unwrap();
+    let voxels: Vec<u8> = (0..120).map(|i| expected([4, 5, 6], 0)(i) as u8).collect();
+    let mut bytes = b"NRRD0004\ntype: uchar\ndimension: 3\nencoding: bzip2\nsizes: 6 5 4\n\n".to_vec();
+    bzip2::read::BzEncoder::new(&voxels[..], bzip2::Compression::fast()).read_to_end(&mut bytes).unwrap();
+    let path = folder.path().join("v.nrrd");
+    fs::write(&path, &bytes).unwrap();
+    assert_eq!(check(&file_input(&path), 0, 0).info().format, "NRRD, bzip2");
+    fs::write(&path, &bytes[..bytes.len() - 5]).unwrap();
+    assert!(whole(&file_input(&path), 0).unwrap_err().to_string().contains("cut off"));
 }
 
 #[test]

@@ -308,14 +308,14 @@ fn lies_are_named() {
         ("e.nrrd", nrrd("sizes: 1 1 1\nspacings: 0 1 1"), "spacing"),
         (
             "f.nrrd",
-            b"NRRD0004\ntype: uchar\ndimension: 3\nencoding: bzip2\nsizes: 1 1 1\n\n0".to_vec(),
-            "raw and gzip are",
+            b"NRRD0004\ntype: uchar\ndimension: 3\nencoding: hex\nsizes: 1 1 1\n\n0".to_vec(),
+            "raw, gzip and bzip2 are",
         ),
         // Text has no byte order.
         (
             "f2.nrrd",
             b"NRRD0004\ntype: short\ndimension: 3\nencoding: ascii\nsizes: 1 1 1\n\n7".to_vec(),
-            "raw and gzip are",
+            "raw, gzip and bzip2 are",
         ),
         ("pair.hdr", pair.clone(), "pairs of .hdr and .img"),
         ("pair.img", vec![0; 64], "pairs of .hdr and .img"),

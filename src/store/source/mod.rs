@@ -4,6 +4,7 @@
 //! unpacks it once, and `lattice` copies boxes. `zarr` reads chunk by chunk, `synthetic` computes.
 
 mod bytes;
+mod chunk_codecs;
 mod detect;
 mod flat;
 mod identity;

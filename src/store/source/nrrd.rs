@@ -1,4 +1,4 @@
-//! NRRD: attached (`.nrrd`) and detached (`.nhdr`) headers, raw and gzip encodings.
+//! NRRD: attached (`.nrrd`) and detached (`.nhdr`) headers, encodings raw, gzip and bzip2.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -316,10 +316,11 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let sizes: Vec<u64> = numbers(path, &h, "sizes", dimension)?.ok_or_else(|| missing("sizes"))?;
     let dtype = dtype(path, h.get("type").ok_or_else(|| missing("type"))?)?;
     // Before the byte order, which text has none of.
-    let gzip = match h.get("encoding").ok_or_else(|| missing("encoding"))?.to_lowercase().as_str() {
-        "raw" => false,
-        "gzip" | "gz" => true,
-        other => return Err(Error::file(path, format!("NRRD encoding {other} is not read; raw and gzip are"))),
+    let packing = match h.get("encoding").ok_or_else(|| missing("encoding"))?.to_lowercase().as_str() {
+        "raw" => None,
+        "gzip" | "gz" => Some(Packing::Gzip),
+        "bzip2" | "bz2" => Some(Packing::Bzip2),
+        other => return Err(Error::file(path, format!("NRRD encoding {other} is not read; raw, gzip and bzip2 are"))),
     };
     let big_endian = match h.get("endian").map(str::to_lowercase).as_deref() {
         Some("big") => true,
@@ -335,7 +336,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let axes = axes(path, &h, &sizes, &directions)?;
     let layout = parts::layout(input, path, &axes, dtype)?;
     let shape = shape_of(path, layout.zyx, dtype.size())?;
-    let mut info = VolumeInfo::plain(shape, dtype, if gzip { "NRRD, gzip" } else { "NRRD, raw" });
+    let mut info = VolumeInfo::plain(shape, dtype, format!("NRRD, {}", packing.map_or("raw", Packing::name)));
     (info.components, info.component_names) = (layout.bases.len(), layout.names.clone());
     info.times = layout.times as usize;
     geometry(path, &h, &axes, &directions, &mut info)?;
@@ -355,7 +356,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
         ));
     }
     if files.len() != 1 || spanned.is_some() {
-        if gzip || skip_lines > 0 {
+        if packing.is_some() || skip_lines > 0 {
             return Err(Error::file(
                 path,
                 "several NRRD data files are read with encoding raw and without line skip only",
@@ -368,16 +369,9 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     }
     let file = &files[0];
     let start = parts::skip_lines(file, if attached { h.len as u64 } else { 0 }, skip_lines as u64)?;
-    if gzip {
+    if let Some(packing) = packing {
         let skip = u64::try_from(skip_bytes).map_err(|_| Error::file(path, "byte skip -1 is for encoding raw only"))?;
-        let packed = Packed {
-            path: file.clone(),
-            packing: Packing::Gzip,
-            start,
-            skip,
-            len: layout.bytes,
-            trailing_ignore: false,
-        };
+        let packed = Packed { path: file.clone(), packing, start, skip, len: layout.bytes, trailing_ignore: false };
         return Ok(Parsed {
             info,
             lattice: lattice(0)?,

@@ -111,67 +111,9 @@ impl Shards {
     }
 }
 
-/// Refuses packed chunks whose own header declares a size other than `want` bytes, before they are unpacked. Only the
-/// outermost codec can be asked, and only where it records a size.
-pub fn check_declared(bytes: &[u8], want: u64, codecs: &[String]) -> Result<(), String> {
-    let mut outer = codecs.iter().rev().map(|c| c.rsplit(['.', '/']).next().unwrap_or(""));
-    let (mut codec, mut body) = (outer.next().unwrap_or(""), bytes);
-    if codec == "crc32c" {
-        codec = outer.next().unwrap_or("");
-        body = body.get(..body.len().saturating_sub(4)).unwrap_or(&[]);
-    }
-    let declared = match codec {
-        "blosc" => body.get(4..8).and_then(|b| b.first_chunk()).map(|b| u32::from_le_bytes(*b) as u64),
-        "zstd" => zstd_size(body),
-        _ => None,
-    };
-    match declared {
-        Some(n) if n != want => Err(format!("it says that it expands to {n} bytes, the metadata say {want}")),
-        _ => Ok(()),
-    }
-}
-
-/// Content size in the header of a zstd frame, where it is recorded.
-fn zstd_size(body: &[u8]) -> Option<u64> {
-    if body.get(..4)? != [0x28, 0xB5, 0x2F, 0xFD] {
-        return None;
-    }
-    let descriptor = *body.get(4)?;
-    let single = descriptor & 0x20 != 0;
-    let window = !single as usize;
-    let dictionary = [0, 1, 2, 4][(descriptor & 3) as usize];
-    let at = 5 + window + dictionary;
-    let number = |n: usize| -> Option<u64> {
-        let mut raw = [0; 8];
-        raw[..n].copy_from_slice(body.get(at..at + n)?);
-        Some(u64::from_le_bytes(raw))
-    };
-    match descriptor >> 6 {
-        0 if single => number(1),
-        0 => None,
-        1 => Some(number(2)? + 256),
-        2 => number(4),
-        _ => number(8),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_declared_size_that_differs_is_refused_before_unpacking() {
-        let blosc: &[String] = &["bytes".into(), "blosc".into()];
-        let mut header = vec![2, 1, 1, 1];
-        header.extend(64u32.to_le_bytes());
-        assert!(check_declared(&header, 64, blosc).is_ok());
-        assert!(check_declared(&header, 65, blosc).unwrap_err().contains("64 bytes"));
-        // A zstd frame of one segment with a 4-byte content size of 3 GiB.
-        let mut zstd = vec![0x28, 0xB5, 0x2F, 0xFD, 0xA0];
-        zstd.extend((3u32 << 30).to_le_bytes());
-        zstd.extend([0; 4]); // where the checksum would be
-        assert!(check_declared(&zstd, 4096, &["bytes".into(), "zstd".into(), "crc32c".into()]).is_err());
-    }
 
     #[test]
     fn the_least_recently_used_shard_is_dropped() {

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
+use bzip2::bufread::MultiBzDecoder;
 use flate2::bufread::{MultiGzDecoder, ZlibDecoder};
 
 use super::bytes;
@@ -15,6 +16,7 @@ use crate::{Error, Result};
 pub enum Packing {
     Gzip,
     Zlib,
+    Bzip2,
 }
 
 /// A packed stream that holds the voxels.
@@ -42,6 +44,7 @@ impl Packing {
         match self {
             Packing::Gzip => "gzip",
             Packing::Zlib => "zlib",
+            Packing::Bzip2 => "bzip2",
         }
     }
 
@@ -51,6 +54,7 @@ impl Packing {
         let read = match self {
             Packing::Gzip => MultiGzDecoder::new(packed).take(want + 1).read_to_end(&mut out),
             Packing::Zlib => ZlibDecoder::new(packed).take(want + 1).read_to_end(&mut out),
+            Packing::Bzip2 => MultiBzDecoder::new(packed).take(want + 1).read_to_end(&mut out),
         };
         read.map_err(|e| format!("the {} data are broken: {e}", self.name()))?;
         if out.len() as u64 > want {
@@ -69,6 +73,7 @@ impl Packed {
         Ok(match self.packing {
             Packing::Gzip => Box::new(MultiGzDecoder::new(file)),
             Packing::Zlib => Box::new(ZlibDecoder::new(file)),
+            Packing::Bzip2 => Box::new(MultiBzDecoder::new(file)),
         })
     }
 

@@ -12,6 +12,7 @@ use zarrs::array::{Array, ArrayBytes, ArrayMetadata, ArrayToBytesCodecTraits, Co
 use zarrs::filesystem::FilesystemStore;
 
 use super::ChunkRead;
+use super::chunk_codecs;
 use super::planar::key;
 use super::planar::{components, shape_of};
 use super::shards::{Shard, Shards};
@@ -174,9 +175,6 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
     Ok(())
 }
 
-/// What a message about a codec ends with.
-const CODECS: &str = "; codecs that are read: blosc, gzip, zlib, zstd, crc32c, transpose and shards of them";
-
 /// Opens a Zarr array or an OME-Zarr image.
 pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     let (folder, mut meta, multiscale) = find(input, path)?;
@@ -208,7 +206,7 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     let components: Vec<Vec<u64>> = pairs.iter().map(index).collect();
 
     let codec_text = meta
-        .byte_codecs
+        .codecs
         .iter()
         .filter(|c| !matches!(c.as_str(), "bytes" | "transpose"))
         .cloned()
@@ -226,7 +224,7 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     }
 
     let failed = |e: String| {
-        let read = if e.contains("codec") { CODECS } else { "" };
+        let read = if e.contains("codec") { chunk_codecs::READ } else { "" };
         Error::file(&folder, format!("the Zarr array cannot be read: {e}{read}"))
     };
     // Files are opened here, under paths of any bytes; the library, which wants UTF-8, only decodes.
@@ -313,14 +311,11 @@ impl ZarrArray {
         let corrupt = |e: String| Error::file(&path, format!("chunk {index:?} cannot be decoded: {e}"));
         let size = self.meta.dtype.size() as u64;
         let want = self.meta.inner.iter().product::<u64>() * size;
-        let bytes = match self.meta.inflate {
-            // Other codecs may still be inside, which make their own size.
-            Some(packing) => {
-                let most = if self.meta.byte_codecs.len() > 2 { self.most_encoded() } else { want };
-                packing.unpack(&bytes, most).map_err(corrupt)?
-            }
+        let unpacked = chunk_codecs::unpacked_bytes(&self.meta.codecs, want, self.most_encoded());
+        let bytes = match self.meta.packing {
+            Some(packing) => packing.unpack(&bytes, *unpacked.end()).map_err(corrupt)?,
             None => {
-                super::shards::check_declared(&bytes, want, &self.meta.byte_codecs).map_err(corrupt)?;
+                chunk_codecs::check_declared(&bytes, &unpacked, &self.meta.codecs).map_err(corrupt)?;
                 bytes
             }
         };

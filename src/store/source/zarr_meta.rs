@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use super::bytes;
+use super::chunk_codecs::{ChunkPacking, codec_name, take_outermost};
 use super::planar::key;
 use super::raw::{numpy_type, refuse};
-use super::spool::Packing;
 use super::units;
 use crate::config::Input;
 use crate::grid::DType;
@@ -30,10 +30,10 @@ pub struct ArrayMeta {
     /// Shape of the unit that is decoded by itself; equal to `outer` where there are no shards.
     pub inner: Vec<u64>,
     pub shard: Option<ShardMeta>,
-    /// Names of the codecs that turn bytes to bytes in an inner chunk, the first applied first when written.
-    pub byte_codecs: Vec<String>,
-    /// The outermost of them where it is gzip or zlib, which are unpacked here, with a bound; `value` lacks it.
-    pub inflate: Option<Packing>,
+    /// Names of the codecs of an inner chunk, the first applied first when written.
+    pub codecs: Vec<String>,
+    /// The outermost of them where it is unpacked here, with a bound; `value` lacks it.
+    pub packing: Option<ChunkPacking>,
     pub names: Vec<Option<String>>,
     /// The metadata, without that codec.
     pub value: Value,
@@ -83,11 +83,6 @@ fn sizes(path: &Path, what: &str, value: &Value, axes: Option<usize>, least: u64
     })
 }
 
-/// Name of a v3 codec.
-fn codec_name(codec: &Value) -> &str {
-    codec.as_str().or_else(|| codec["name"].as_str()).unwrap_or("")
-}
-
 /// Metadata of the array in `folder`; `None` where there is none.
 pub fn array(folder: &Path) -> Result<Option<ArrayMeta>> {
     let v3 = folder.join("zarr.json");
@@ -110,22 +105,6 @@ pub fn array(folder: &Path) -> Result<Option<ArrayMeta>> {
     }
 }
 
-/// Takes the last codec off a list if it is gzip or zlib.
-fn take_inflate(codecs: &mut Value) -> Option<Packing> {
-    let list = codecs.as_array_mut()?;
-    let packing = packing(codec_name(list.last()?))?;
-    list.pop();
-    Some(packing)
-}
-
-fn packing(name: &str) -> Option<Packing> {
-    match name {
-        "gzip" => Some(Packing::Gzip),
-        "zlib" | "numcodecs.zlib" => Some(Packing::Zlib),
-        _ => None,
-    }
-}
-
 fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
     let broken = |text: String| Error::file(path, format!("broken Zarr metadata: {text}"));
     let shape = sizes(path, "shape", &value["shape"], None, 1)?;
@@ -144,8 +123,8 @@ fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
         names: dimension_names(&value["dimension_names"], shape.len()),
         inner: outer.clone(),
         shard: None,
-        byte_codecs: names(list),
-        inflate: None,
+        codecs: names(list),
+        packing: None,
         value: Value::Null,
         shape,
         dtype,
@@ -175,12 +154,12 @@ fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
             Some("start") => false,
             Some(other) => return Err(broken(format!("index_location {other}; start or end are expected"))),
         };
-        meta.byte_codecs = names(config["codecs"].as_array().ok_or_else(|| broken("a shard without codecs".into()))?);
+        meta.codecs = names(config["codecs"].as_array().ok_or_else(|| broken("a shard without codecs".into()))?);
         let inner = &mut value["codecs"][0]["configuration"]["codecs"];
-        meta.inflate = take_inflate(inner);
+        meta.packing = take_outermost(inner);
         meta.shard = Some(ShardMeta { codecs: inner.clone(), index_at_end, index_crc, grid });
     } else {
-        meta.inflate = take_inflate(&mut value["codecs"]);
+        meta.packing = take_outermost(&mut value["codecs"]);
     }
     check_chunk(path, &meta)?;
     meta.value = value;
@@ -195,9 +174,11 @@ fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> 
     let outer = sizes(path, "chunks", &value["chunks"], Some(shape.len()), 1)?;
     let descr = value["dtype"].as_str().ok_or_else(|| refuse(path, "a structured type"))?;
     let dtype = numpy_type(path, descr)?.1;
-    let byte_codecs: Vec<String> = value["compressor"]["id"].as_str().map(str::to_string).into_iter().collect();
-    let inflate = byte_codecs.first().and_then(|id| packing(id));
-    if inflate.is_some() {
+    let filters = value["filters"].as_array().map_or(&[][..], |l| l);
+    let ids = filters.iter().chain([&value["compressor"]]).filter_map(|c| c["id"].as_str());
+    let codecs: Vec<String> = ids.map(str::to_string).collect();
+    let packing = value["compressor"]["id"].as_str().and_then(ChunkPacking::named);
+    if packing.is_some() {
         value["compressor"] = Value::Null;
     }
     let meta = ArrayMeta {
@@ -205,8 +186,8 @@ fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> 
         names: dimension_names(&attributes["_ARRAY_DIMENSIONS"], shape.len()),
         inner: outer.clone(),
         shard: None,
-        byte_codecs,
-        inflate,
+        codecs,
+        packing,
         value,
         shape,
         dtype,
