@@ -48,8 +48,14 @@ fn main() {
         for radius in [10, 64] {
             row(format!("window cdf_power radius {radius}"), &|| power_job(dtype, radius));
         }
-        for moment in ["mean", "variance"] {
-            row(format!("gaussian sigma 3 {moment}"), &|| gaussian_job(dtype, moment == "variance"));
+        for (sigma, moment) in [1, 3, 10].into_iter().flat_map(|s| [(s, "mean"), (s, "variance")]) {
+            let variance = moment == "variance";
+            row(format!("gaussian sigma {sigma} {moment}"), &|| gaussian_job(dtype, sigma as f64, variance, false));
+            if dtype == DType::F32 {
+                row(format!("gaussian sigma {sigma} {moment} gaps"), &|| {
+                    gaussian_job(dtype, sigma as f64, variance, true)
+                });
+            }
         }
         row("occlusion map, base and chain".into(), &|| chain_job(dtype));
         for size in [3, 5] {
@@ -198,13 +204,18 @@ fn power_job<'a>(dtype: DType, radius: usize) -> Job<'a> {
     })
 }
 
-fn gaussian_job<'a>(dtype: DType, variance: bool) -> Job<'a> {
-    let sigma = [3.0; 3];
-    Job::new(dtype, reach(sigma), move |src, at, out, cx| {
+/// `gaps`: every hundredth voxel is missing.
+fn gaussian_job<'a>(dtype: DType, sigma: f64, variance: bool, gaps: bool) -> Job<'a> {
+    let sigma = [sigma; 3];
+    let mut job = Job::new(dtype, reach(sigma), move |src, at, out, cx| {
         let out = Some(out.view_mut(BOX));
         let (mean, variance) = if variance { (None, out) } else { (out, None) };
         gaussian(src, sigma, Affine::IDENTITY, None, at, mean, variance, cx);
-    })
+    });
+    if let (true, Voxels::F32(v)) = (gaps, &mut job.src.0) {
+        v.iter_mut().step_by(101).for_each(|v| *v = f32::NAN);
+    }
+    job
 }
 
 /// Every level of the map of the box, from its data; the last level's moments stand at the front of the result.

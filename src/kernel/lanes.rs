@@ -29,6 +29,10 @@ pub trait F64x8: Copy {
     fn less(self, b: Self, c: Self) -> Self;
     /// `self` where `sign > 0`, else 0.
     fn where_positive(self, sign: Self) -> Self;
+    /// `self` where `sign > 0`, else `other`.
+    fn choose(self, sign: Self, other: Self) -> Self;
+    /// Whether every lane is above 0.
+    fn all_positive(self) -> bool;
     /// `self`, or 0 where it is NaN; and 1 or 0 accordingly.
     fn present(self) -> [Self; 2];
     /// Rows become columns.
@@ -93,6 +97,14 @@ impl F64x8 for Plain {
     #[inline(always)]
     fn where_positive(self, sign: Self) -> Self {
         self.zip(sign, |v, s| if s > 0.0 { v } else { 0.0 })
+    }
+    #[inline(always)]
+    fn choose(self, sign: Self, other: Self) -> Self {
+        Plain(std::array::from_fn(|i| if sign.0[i] > 0.0 { self.0[i] } else { other.0[i] }))
+    }
+    #[inline(always)]
+    fn all_positive(self) -> bool {
+        self.0.iter().all(|v| *v > 0.0)
     }
     #[inline(always)]
     fn present(self) -> [Self; 2] {
@@ -172,6 +184,15 @@ mod x86 {
             Avx512(unsafe { _mm512_maskz_mov_pd(mask, self.0) })
         }
         #[inline(always)]
+        fn choose(self, sign: Self, other: Self) -> Self {
+            let mask = unsafe { _mm512_cmp_pd_mask::<_CMP_GT_OQ>(sign.0, _mm512_setzero_pd()) };
+            Avx512(unsafe { _mm512_mask_mov_pd(other.0, mask, self.0) })
+        }
+        #[inline(always)]
+        fn all_positive(self) -> bool {
+            unsafe { _mm512_cmp_pd_mask::<_CMP_GT_OQ>(self.0, _mm512_setzero_pd()) == 0xff }
+        }
+        #[inline(always)]
         fn present(self) -> [Self; 2] {
             let there = unsafe { _mm512_cmp_pd_mask::<_CMP_ORD_Q>(self.0, self.0) };
             unsafe {
@@ -206,6 +227,16 @@ mod x86 {
     #[inline(always)]
     unsafe fn positive(v: __m256d, sign: __m256d) -> __m256d {
         unsafe { _mm256_and_pd(v, _mm256_cmp_pd::<_CMP_GT_OQ>(sign, _mm256_setzero_pd())) }
+    }
+
+    #[inline(always)]
+    unsafe fn chosen(v: __m256d, sign: __m256d, other: __m256d) -> __m256d {
+        unsafe { _mm256_blendv_pd(other, v, _mm256_cmp_pd::<_CMP_GT_OQ>(sign, _mm256_setzero_pd())) }
+    }
+
+    #[inline(always)]
+    unsafe fn positives(v: __m256d) -> i32 {
+        unsafe { _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_GT_OQ>(v, _mm256_setzero_pd())) }
     }
 
     #[inline(always)]
@@ -277,6 +308,14 @@ mod x86 {
         #[inline(always)]
         fn where_positive(self, sign: Self) -> Self {
             halves!(positive, self, sign)
+        }
+        #[inline(always)]
+        fn choose(self, sign: Self, other: Self) -> Self {
+            halves!(chosen, self, sign, other)
+        }
+        #[inline(always)]
+        fn all_positive(self) -> bool {
+            unsafe { positives(self.0[0]) & positives(self.0[1]) == 0xf }
         }
         #[inline(always)]
         fn present(self) -> [Self; 2] {
@@ -355,6 +394,7 @@ mod tests {
             .into_iter()
             .chain(V::turn(rows))
             .chain(y.present())
+            .chain([x.choose(y, z), V::splat(x.all_positive().into()), V::splat(two.all_positive().into())])
             .for_each(&mut put);
         let single: [f32; 8] = std::array::from_fn(|i| i as f32 / 3.0);
         // SAFETY: eight values.

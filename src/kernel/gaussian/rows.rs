@@ -1,14 +1,20 @@
 //! One row of one pass: moments of taps that lie at other places of a buffer, row by row, so that the same code serves x, y
-//! and z. Loops run along the row; every voxel sees its taps in the same order wherever its row starts.
+//! and z. Every voxel sees its taps in the same order wherever its row starts. Rows are whole vectors: [`LANES`] divides their
+//! length, and sums stay in registers from the first tap to the last.
 
+use super::taps::{Edges, Taps};
 use crate::grid::Voxel;
+use crate::kernel::lanes::F64x8;
+use crate::kernel::simd::Level;
+use crate::kernel::singles::{F32x32, SINGLES};
 use crate::kernel::values::missing_as;
-use crate::multiversion;
+use crate::{multiversion, on_lanes, on_singles};
+
+/// What rows are multiples of.
+pub(super) const LANES: usize = SINGLES;
 
 /// What passes are computed in.
-pub(super) trait Real:
-    Voxel + std::ops::Add<Output = Self> + std::ops::Sub<Output = Self> + std::ops::Mul<Output = Self>
-{
+pub(super) trait Real: Voxel {
     fn narrow(v: f64) -> Self;
 }
 
@@ -23,25 +29,6 @@ impl Real for f64 {
     #[inline(always)]
     fn narrow(v: f64) -> f64 {
         v
-    }
-}
-
-/// Taps of one row: for k = 1, 2, ... the two rows k steps before and after, by their place in the buffer, and their
-/// weights. A row that does not exist stands at the centre's place, and its own weight is 0.
-pub(super) struct Taps<'a> {
-    pub centre: usize,
-    /// Places before and after, in turn.
-    pub places: &'a [u32],
-    /// `[w]`: weight of the centre, then before and after in turn.
-    pub weights: &'a [f64],
-}
-
-impl Taps<'_> {
-    /// Places and weights of pair k, from 0; the larger weight is the pair's, since one of them may not exist.
-    #[inline(always)]
-    fn pair(&self, k: usize) -> ([usize; 2], [f64; 2]) {
-        let places = [self.places[2 * k] as usize, self.places[2 * k + 1] as usize];
-        (places, [self.weights[2 * k + 1], self.weights[2 * k + 2]])
     }
 }
 
@@ -61,117 +48,318 @@ fn load_inner<T: Voxel, F: Real>(src: &[T], missing: Option<i64>, dst: &mut [F])
     }
 }
 
-multiversion! {
-    /// Weighted mean of the taps: `c + sum_k w_k ((a_k + b_k) - 2 c)`, exactly c where all are equal.
-    pub(super) fn mean_row[F: Real](buffer: &[F], taps: &Taps, out: &mut [F]) -> () = mean_inner;
+/// Weighted mean of the taps: `c + sum_k w_k ((a_k + b_k) - 2 c)`, exactly c where all are equal; with `edges`, by the weights
+/// of each lane. The GPU's shader has the same operations in the same order.
+///
+/// Panics if the taps leave the buffer or the row is no multiple of [`LANES`].
+pub(super) fn mean_row(level: Level, from: &[f32], taps: &Taps<f32>, edges: Option<&Edges<f32>>, out: &mut [f32]) {
+    assert!(out.len().is_multiple_of(LANES) && taps.inside(out.len(), from.len()), "taps inside the buffer");
+    match edges {
+        None => means::<false>(level, from, taps, [&[]; 3], out),
+        Some(edges) => means::<true>(level, from, taps, edges.lanes(taps, out.len()), out),
+    }
+}
+
+on_singles! {
+    /// `edges`: weights by lane, and the room before and after, where `EDGE`.
+    fn means[const EDGE: bool](from: &[f32], taps: &Taps<f32>, edges: [&[f32]; 3], out: &mut [f32]) = means_inner[EDGE];
 }
 
 #[inline(always)]
-fn mean_inner<F: Real>(buffer: &[F], taps: &Taps, out: &mut [F]) {
+fn means_inner<V: F32x32, const EDGE: bool>(from: &[f32], taps: &Taps<f32>, edges: [&[f32]; 3], out: &mut [f32]) {
     let n = out.len();
-    let c = &buffer[taps.centre..][..n];
-    out.copy_from_slice(c);
-    let pairs = taps.places.len() / 2;
-    let row = |place: usize| &buffer[place..][..n];
-    let pair = |k: usize| {
-        let (places, weights) = taps.pair(k);
-        (row(places[0]), row(places[1]), F::narrow(weights[0].max(weights[1])))
-    };
-    let mut k = 0;
-    // three pairs a time: fewer trips of the sum through memory, in the same order
-    while k + 3 <= pairs {
-        let ((a0, b0, w0), (a1, b1, w1), (a2, b2, w2)) = (pair(k), pair(k + 1), pair(k + 2));
-        for i in 0..n {
-            let twice = c[i] + c[i];
-            let sum = out[i] + w0 * ((a0[i] + b0[i]) - twice);
-            let sum = sum + w1 * ((a1[i] + b1[i]) - twice);
-            out[i] = sum + w2 * ((a2[i] + b2[i]) - twice);
+    let from = from.as_ptr();
+    let [weights, before, after] = edges.map(|e| e.as_ptr());
+    for i in (0..n).step_by(SINGLES) {
+        // SAFETY: here and below, `mean_row` has checked that SINGLES divides n, that n values stand at every tap's place, and
+        // that every lane has weights and room.
+        let c = unsafe { V::load(from.add(taps.centre + i)) };
+        let twice = c.plus(c);
+        let mut sum = c;
+        for (k, &[p, q]) in taps.pairs.iter().enumerate() {
+            let (mut a, mut b) = unsafe { (V::load(from.add(p as usize + i)), V::load(from.add(q as usize + i))) };
+            let mut w = V::splat(taps.weights[k + 1]);
+            if EDGE {
+                let far = V::splat((k + 1) as f32);
+                let room = unsafe { [V::load(before.add(i)), V::load(after.add(i))] };
+                a = V::pick(far.is_below(room[0]), a, c);
+                b = V::pick(far.is_below(room[1]), b, c);
+                w = unsafe { V::load(weights.add((k + 1) * n + i)) };
+            }
+            sum = sum.plus(w.times(a.plus(b).minus(twice)));
         }
-        k += 3;
-    }
-    while k < pairs {
-        let (a, b, w) = pair(k);
-        for i in 0..n {
-            out[i] = out[i] + w * ((a[i] + b[i]) - (c[i] + c[i]));
+        for (k, &[p, _]) in taps.singles.iter().enumerate() {
+            let a = unsafe { V::load(from.add(p as usize + i)) };
+            let w = V::splat(taps.weights[taps.pairs.len() + k + 1]);
+            sum = sum.plus(w.times(a.plus(c).minus(twice)));
         }
-        k += 1;
+        // SAFETY: as above.
+        unsafe { sum.store(out.as_mut_ptr().add(i)) };
     }
 }
 
-multiversion! {
-    /// Pooled variance of the taps about `mean`: `sum_k w_k (V_k + (m_k - mean)^2)`; without `within` the V are 0.
-    pub(super) fn variance_row[F: Real](
-        means: &[F], within: Option<&[F]>, taps: &Taps, mean: &[F], out: &mut [F],
-    ) -> () = variance_inner;
+/// Mean and variance of the taps, whose own variances are `within` (none: 0), as sums relative to the centre tap c:
+/// `m = c + S`, `S = sum_k w_k (m_k - c)`; `V = sum_k w_k (V_k + (m_k - c)^2) - S^2`. The centre's own weight w bounds what
+/// the difference can lose: `S^2` is at most 1 - w of the sum that it is taken from. Exactly c and 0 where all are equal.
+///
+/// Panics if the taps leave the buffer or the row is no multiple of [`LANES`].
+pub(super) fn moment_row(
+    level: Level,
+    [means, within]: [&[f64]; 2],
+    spread: bool,
+    taps: &Taps<f64>,
+    edges: Option<&Edges<f64>>,
+    [mean, variance]: [&mut [f64]; 2],
+) {
+    let n = mean.len();
+    let whole = n.is_multiple_of(LANES) && variance.len() == n && within.len() == means.len();
+    assert!(whole && taps.inside(n, means.len()), "taps inside the buffer");
+    match (edges, spread) {
+        (None, false) => moments::<false, false>(level, [means, within], taps, [&[]; 3], [mean, variance]),
+        (None, true) => moments::<true, false>(level, [means, within], taps, [&[]; 3], [mean, variance]),
+        (Some(e), _) => moments::<false, true>(level, [means, within], taps, e.lanes(taps, n), [mean, variance]),
+    }
 }
+
+on_lanes! {
+    /// `SPREAD`: taps have variances; `EDGE`: as [`means`].
+    fn moments[const SPREAD: bool, const EDGE: bool](
+        from: [&[f64]; 2], taps: &Taps<f64>, edges: [&[f64]; 3], out: [&mut [f64]; 2]
+    ) = moments_inner[SPREAD, EDGE];
+}
+
+/// Vectors of a row side by side: the chain of one sum hides behind the others'.
+const ABREAST: usize = 2;
 
 #[inline(always)]
-fn variance_inner<F: Real>(means: &[F], within: Option<&[F]>, taps: &Taps, mean: &[F], out: &mut [F]) {
-    let n = out.len();
-    let mean = &mean[..n];
-    let mut add = |place: usize, w: f64, first: bool| {
-        let w = F::narrow(w);
-        let m = &means[place..][..n];
-        match (within, first) {
-            (Some(v), true) => {
-                let v = &v[place..][..n];
-                (0..n).for_each(|i| out[i] = w * (v[i] + (m[i] - mean[i]) * (m[i] - mean[i])));
+fn moments_inner<V: F64x8, const SPREAD: bool, const EDGE: bool>(
+    from: [&[f64]; 2],
+    taps: &Taps<f64>,
+    edges: [&[f64]; 3],
+    [mean, variance]: [&mut [f64]; 2],
+) {
+    let n = mean.len();
+    let [m, v] = from.map(|f| f.as_ptr());
+    let [weights, before, after] = edges.map(|e| e.as_ptr());
+    let zero = V::splat(0.0);
+    for start in (0..n).step_by(8 * ABREAST) {
+        let mut c = [zero; ABREAST];
+        let (mut s, mut q) = ([zero; ABREAST], [zero; ABREAST]);
+        for j in 0..ABREAST {
+            let i = start + 8 * j;
+            // SAFETY: here and below, `moment_row` has checked that 16 divides n, that n values stand at every tap's place, and
+            // that every lane has weights and room.
+            c[j] = unsafe { V::load(m.add(taps.centre + i)) };
+            if SPREAD {
+                q[j] = V::splat(taps.weights[0]).times(unsafe { V::load(v.add(taps.centre + i)) });
             }
-            (Some(v), false) => {
-                let v = &v[place..][..n];
-                (0..n).for_each(|i| out[i] = out[i] + w * (v[i] + (m[i] - mean[i]) * (m[i] - mean[i])));
-            }
-            (None, true) => (0..n).for_each(|i| out[i] = w * ((m[i] - mean[i]) * (m[i] - mean[i]))),
-            (None, false) => (0..n).for_each(|i| out[i] = out[i] + w * ((m[i] - mean[i]) * (m[i] - mean[i]))),
         }
-    };
-    add(taps.centre, taps.weights[0], true);
-    for k in 0..taps.places.len() / 2 {
-        let (places, weights) = taps.pair(k);
-        add(places[0], weights[0], false);
-        add(places[1], weights[1], false);
+        for (k, &[left, right]) in taps.pairs.iter().enumerate() {
+            let splat = V::splat(taps.weights[k + 1]);
+            for j in 0..ABREAST {
+                let i = start + 8 * j;
+                let at = [left as usize + i, right as usize + i];
+                let mut w = splat;
+                let mut a = unsafe { V::load(m.add(at[0])) }.minus(c[j]);
+                let mut b = unsafe { V::load(m.add(at[1])) }.minus(c[j]);
+                if EDGE {
+                    let far = V::splat((k + 1) as f64);
+                    a = a.where_positive(unsafe { V::load(before.add(i)) }.minus(far));
+                    b = b.where_positive(unsafe { V::load(after.add(i)) }.minus(far));
+                    w = unsafe { V::load(weights.add((k + 1) * n + i)) };
+                }
+                let mut square = a.times(a);
+                if SPREAD {
+                    let own = unsafe { V::load(v.add(at[0])).plus(V::load(v.add(at[1]))) };
+                    square = a.fused(a, own);
+                }
+                s[j] = w.fused(a.plus(b), s[j]);
+                q[j] = w.fused(b.fused(b, square), q[j]);
+            }
+        }
+        for (k, &[place, _]) in taps.singles.iter().enumerate() {
+            let w = V::splat(taps.weights[taps.pairs.len() + k + 1]);
+            for j in 0..ABREAST {
+                let at = place as usize + start + 8 * j;
+                let a = unsafe { V::load(m.add(at)) }.minus(c[j]);
+                let own = if SPREAD { unsafe { V::load(v.add(at)) } } else { zero };
+                s[j] = w.fused(a, s[j]);
+                q[j] = w.fused(a.fused(a, own), q[j]);
+            }
+        }
+        for j in 0..ABREAST {
+            let i = start + 8 * j;
+            // SAFETY: as above.
+            unsafe {
+                c[j].plus(s[j]).store(mean.as_mut_ptr().add(i));
+                // a centre that is no number leaves none, also where it is the only tap
+                let spread = s[j].less(s[j], q[j]).plus(c[j].minus(c[j]));
+                not_below_zero(spread).store(variance.as_mut_ptr().add(i));
+            }
+        }
     }
+}
+
+/// `v`, or 0 where rounding left it below; NaN stays.
+#[inline(always)]
+fn not_below_zero<V: F64x8>(v: V) -> V {
+    let below = V::splat(0.0).minus(v);
+    v.plus(below.where_positive(below))
 }
 
 /// Mean, variance and weight of cells that may have no valid voxel (weight 0).
-pub(super) struct Pooled<'a, F> {
-    pub mean: &'a [F],
-    pub variance: &'a [F],
-    pub weight: &'a [F],
+#[derive(Clone, Copy)]
+pub(super) struct Pooled<'a> {
+    pub mean: &'a [f64],
+    pub variance: &'a [f64],
+    pub weight: &'a [f64],
 }
 
-multiversion! {
-    /// Pools the taps by their own weights times those of the pass. Constants stay exact: sums are taken relative to a tap
-    /// that is valid (the centre's where it is), except where that overflows or an infinity stands.
-    pub(super) fn pool_row[F: Real](
-        from: &Pooled<F>, taps: &Taps, mean: &mut [F], variance: &mut [F], weight: &mut [F],
-    ) -> () = pool_inner;
-}
-
-#[inline(always)]
-fn pool_inner<F: Real>(from: &Pooled<F>, taps: &Taps, mean: &mut [F], variance: &mut [F], weight: &mut [F]) {
-    for i in 0..mean.len() {
-        let (m, v, w) = pool_one(from, taps, i);
-        (mean[i], variance[i], weight[i]) = (F::narrow(m), F::narrow(v), F::narrow(w));
+/// Pools the taps by their own weights times those of the pass, as [`moment_row`] does, relative to the centre where it is
+/// valid, else to the nearest tap that is. Where that is not finite (an infinity, an overflow), by [`pool_one`].
+///
+/// Panics if the taps leave the buffer or the row is no multiple of [`LANES`].
+pub(super) fn pool_row(level: Level, from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3]) {
+    let n = out[0].len();
+    let whole = n.is_multiple_of(LANES) && out.iter().all(|o| o.len() == n);
+    let alike = [from.variance.len(), from.weight.len()] == [from.mean.len(); 2];
+    assert!(whole && alike && taps.inside(n, from.mean.len()), "taps inside the buffer");
+    let [mean, variance, weight] = out;
+    let mut finite = true;
+    pooled(level, from, taps, [&mut *mean, &mut *variance, &mut *weight], &mut finite);
+    if !finite {
+        for i in 0..n {
+            if !(mean[i].is_finite() && variance[i].is_finite()) {
+                (mean[i], variance[i], weight[i]) = pool_one(&from, taps, i);
+            }
+        }
     }
 }
 
+on_lanes! {
+    /// `finite` says whether all is.
+    fn pooled[](from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], finite: &mut bool) = pooled_inner[];
+}
+
 #[inline(always)]
-fn pool_one<F: Real>(from: &Pooled<F>, taps: &Taps, i: usize) -> (f64, f64, f64) {
+fn pooled_inner<V: F64x8>(from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], finite: &mut bool) {
+    let [mean, variance, weight] = out;
+    let zero = V::splat(0.0);
+    let mut blank = zero;
+    for i in (0..mean.len()).step_by(8) {
+        // SAFETY: `pool_row` has checked that 8 divides the length and that as many values stand at every tap's place.
+        let cells = unsafe { Cells::<V>::after(&from, i) };
+        let own = cells.weight(taps.centre);
+        let c = cells.pivot(taps, own);
+        let mut sums = [zero; 3];
+        cells.add(taps.centre, taps.weights[0], c, &mut sums);
+        for (&[left, right], &w) in taps.pairs.iter().zip(&taps.weights[1..]) {
+            cells.add(left as usize, w, c, &mut sums);
+            cells.add(right as usize, w, c, &mut sums);
+        }
+        for (&[place, _], &w) in taps.singles.iter().zip(&taps.weights[1 + taps.pairs.len()..]) {
+            cells.add(place as usize, w, c, &mut sums);
+        }
+        let [total, s, q] = sums;
+        let s = s.over(total).where_positive(total);
+        let spread = not_below_zero(s.less(s, q.over(total))).where_positive(total);
+        let m = c.plus(s).where_positive(total);
+        blank = blank.plus(m.minus(m)).plus(spread.minus(spread));
+        // SAFETY: as above.
+        unsafe {
+            m.store(mean.as_mut_ptr().add(i));
+            spread.store(variance.as_mut_ptr().add(i));
+            total.store(weight.as_mut_ptr().add(i));
+        }
+    }
+    let mut sum = [0.0; 8];
+    // SAFETY: eight values.
+    unsafe { blank.store(sum.as_mut_ptr()) };
+    *finite = sum == [0.0; 8];
+}
+
+/// Eight columns of cells, by the places of their rows.
+struct Cells<V> {
+    mean: *const f64,
+    variance: *const f64,
+    weight: *const f64,
+    lanes: std::marker::PhantomData<V>,
+}
+
+impl<V: F64x8> Cells<V> {
+    /// Columns `i` to `i + 8`.
+    ///
+    /// # Safety
+    /// Places given to the methods have eight values from `i` on.
+    #[inline(always)]
+    unsafe fn after(from: &Pooled, i: usize) -> Cells<V> {
+        // SAFETY: the caller's promise.
+        let [mean, variance, weight] = [from.mean, from.variance, from.weight].map(|f| unsafe { f.as_ptr().add(i) });
+        Cells { mean, variance, weight, lanes: std::marker::PhantomData }
+    }
+
+    #[inline(always)]
+    fn weight(&self, place: usize) -> V {
+        // SAFETY: the promise of `after`.
+        unsafe { V::load(self.weight.add(place)) }
+    }
+
+    #[inline(always)]
+    fn mean(&self, place: usize) -> V {
+        // SAFETY: the promise of `after`.
+        unsafe { V::load(self.mean.add(place)) }
+    }
+
+    /// The mean of the centre where its weight `own` is positive, else of the nearest tap whose is, else 0.
+    #[inline(always)]
+    fn pivot(&self, taps: &Taps<f64>, own: V) -> V {
+        let centre = self.mean(taps.centre);
+        if own.all_positive() {
+            return centre;
+        }
+        let mut pivot = V::splat(0.0);
+        for &[place, _] in taps.singles.iter().rev() {
+            pivot = self.mean(place as usize).choose(self.weight(place as usize), pivot);
+        }
+        for &[left, right] in taps.pairs.iter().rev() {
+            pivot = self.mean(right as usize).choose(self.weight(right as usize), pivot);
+            pivot = self.mean(left as usize).choose(self.weight(left as usize), pivot);
+        }
+        centre.choose(own, pivot)
+    }
+
+    /// Adds a tap of weight `w` to the sums of weights, of weighted means from `c` on, and of weighted squares.
+    #[inline(always)]
+    fn add(&self, place: usize, w: f64, c: V, sums: &mut [V; 3]) {
+        let share = V::splat(w).times(self.weight(place));
+        let away = self.mean(place).minus(c);
+        // SAFETY: the promise of `after`.
+        let own = unsafe { V::load(self.variance.add(place)) };
+        sums[0] = sums[0].plus(share);
+        sums[1] = share.fused(away, sums[1]);
+        sums[2] = share.fused(away.fused(away, own), sums[2]);
+    }
+}
+
+/// One voxel of [`pool_row`] in two passes, for what is not finite: sums are taken relative to a tap that is valid, except where
+/// that overflows or an infinity stands.
+fn pool_one(from: &Pooled, taps: &Taps<f64>, i: usize) -> (f64, f64, f64) {
     // calls f(w, m, v) for every valid tap
     let each = |f: &mut dyn FnMut(f64, f64, f64)| {
-        let mut one = |place: usize, w: f64| {
-            let w = w * from.weight[place + i].to_f64();
+        let mut one = |place: u32, w: f64| {
+            let at = place as usize + i;
+            let w = w * from.weight[at];
             if w > 0.0 {
-                f(w, from.mean[place + i].to_f64(), from.variance[place + i].to_f64());
+                f(w, from.mean[at], from.variance[at]);
             }
         };
-        for k in 0..taps.places.len() / 2 {
-            let (places, weights) = taps.pair(k);
-            one(places[0], weights[0]);
-            one(places[1], weights[1]);
+        for (pair, w) in taps.pairs.iter().zip(&taps.weights[1..]) {
+            pair.iter().for_each(|p| one(*p, *w));
         }
-        one(taps.centre, taps.weights[0]);
+        for ([place, _], w) in taps.singles.iter().zip(&taps.weights[1 + taps.pairs.len()..]) {
+            one(*place, *w);
+        }
+        one(taps.centre as u32, taps.weights[0]);
     };
     let (mut total, mut plain, mut pivot) = (0.0, 0.0, 0.0);
     each(&mut |w, m, _| {

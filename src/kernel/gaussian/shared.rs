@@ -1,6 +1,7 @@
 //! What another device needs: half-widths, weights, and the last step from unscaled moments to results.
 
 use super::rows::store_row;
+use super::taps::{bell, total};
 use crate::grid::{Affine, AnyViewMut, Shape};
 use crate::kernel::simd::Level;
 
@@ -13,16 +14,16 @@ pub fn radius(sigma: [f64; 3], src: Shape) -> [usize; 3] {
 /// centre's is what is left. A tap that exists at neither side weighs 0.
 pub fn weights(sigma: f64, radius: usize, p: usize, n: usize) -> impl Iterator<Item = f32> {
     let (before, after) = (p, n - 1 - p);
-    let total = super::total(|k| super::bell(sigma, k), radius, before, after);
+    let total = total(|k| bell(sigma, k), radius, before, after);
     (1..=radius).map(move |k| {
         let exists = k <= before || k <= after;
-        if exists { (super::bell(sigma, k) / total) as f32 } else { 0.0 }
+        if exists { (bell(sigma, k) / total) as f32 } else { 0.0 }
     })
 }
 
 /// What is left for the centre.
 pub fn centre_weight(sigma: f64, radius: usize, p: usize, n: usize) -> f32 {
-    (1.0 / super::total(|k| super::bell(sigma, k), radius, p, n - 1 - p)) as f32
+    (1.0 / total(|k| bell(sigma, k), radius, p, n - 1 - p)) as f32
 }
 
 /// Scales one row of means as [`super::gaussian`] does (variances by the squared slope and no intercept), into voxels `to..` of a row of `dst`.

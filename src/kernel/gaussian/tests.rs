@@ -2,6 +2,7 @@ use super::*;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::Region;
 use crate::kernel::hostile::{Noise, SHAPES, calm, constant, volume};
+use crate::kernel::simd::Level;
 
 /// The 3-D sum over voxels that exist: mean, variance and sum of weights, in f64, in two passes.
 fn reference(v: &Voxels, shape: Shape, sigma: [f64; 3], missing: Option<i64>) -> Vec<[f64; 2]> {
