@@ -75,6 +75,19 @@ impl Pool {
         buffer
     }
 
+    /// `len` numbers with undefined contents, for levels of a pyramid.
+    pub fn take_numbers(&self, len: usize) -> Vec<f64> {
+        match self.take(DType::F64, len) {
+            Voxels::F64(numbers) => numbers,
+            other => unreachable!("asked for f64, got {}", other.dtype()),
+        }
+    }
+
+    /// Takes back what [`Pool::take_numbers`] gave.
+    pub fn put_numbers(&self, numbers: Vec<f64>) {
+        self.put(Voxels::F64(numbers));
+    }
+
     /// Takes a buffer back.
     pub fn put(&self, buffer: Voxels) {
         let mut state = self.lock();
@@ -121,6 +134,8 @@ mod tests {
         assert!(pool.take(DType::U8, 30000).at(0) == 0.0, "another type");
         assert!(pool.take(DType::F32, 1000).at(0) == 0.0, "nine times too large");
         assert!(pool.take(DType::F32, 8000).at(0) == 3.0);
+        pool.put_numbers(vec![5.0; 100]);
+        assert_eq!(pool.take_numbers(60), vec![5.0; 60]);
     }
 
     #[test]

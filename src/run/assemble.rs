@@ -185,7 +185,8 @@ impl Assembler<'_> {
     ) -> Result<()> {
         let output = place.output;
         let mut cx = Context { level: self.level, scratch };
-        let (mut cells, mut fine) = (Cells::default(), Cells::default());
+        let mut cells = self.room(output, 1, brick);
+        let mut fine = if output.brick_level() > 1 { self.room(output, 2, brick) } else { Cells::default() };
         for k in 1..=output.brick_level() {
             let halved = output.level(k).expect("level exists").halved;
             if k == 1 {
@@ -204,7 +205,18 @@ impl Assembler<'_> {
             cells.store(&mut data);
             self.spill(place, brick, &data);
         }
+        for made in [cells, fine] {
+            let numbers = [made.value, made.inner, made.between];
+            numbers.into_iter().filter(|n| n.capacity() > 0).for_each(|n| self.pool.put_numbers(n));
+        }
         Ok(())
+    }
+
+    /// Room for the cells of level `k` over a brick.
+    fn room(&self, output: &OutputPlan, k: usize, brick: Region) -> Cells {
+        let (n, moments) = (output.level_box(k, brick).voxels(), output.reduce == crate::stage::Reduce::Moments);
+        let spread = || if moments { self.pool.take_numbers(n) } else { Vec::new() };
+        Cells { value: self.pool.take_numbers(n), inner: spread(), between: spread(), ..Cells::default() }
     }
 
     pub fn mapping(&self, place: &Place) -> Mapping {

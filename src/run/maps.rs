@@ -3,7 +3,7 @@
 use super::assemble::{Assembler, Item, Place, Target, TaskSlot, as_bytes};
 use super::compute::Finished;
 use super::value::Comp;
-use crate::brick::Scratch;
+use crate::brick::{Pool, Scratch};
 use crate::gpu::MapLevels;
 use crate::gpu::maps::MapCodes;
 use crate::grid::{AnyView, Region, View};
@@ -35,7 +35,9 @@ pub fn assemble(
     let base = || base_level(assembler, output, map, done, boxes[0]);
     if let Some(made) = made {
         if map.first == 0 {
-            store(assembler, index, output, target, slot, 0, &base(), boxes[0], boxes[0], items)?;
+            let moments = base();
+            store(assembler, index, output, target, slot, 0, &moments, boxes[0], boxes[0], items)?;
+            give_back(assembler.pool, moments);
         }
         for (k, codes) in (1..).zip(&made.codes) {
             for (component, voxels) in codes.iter().enumerate() {
@@ -50,9 +52,9 @@ pub fn assemble(
     for k in 0..=last {
         if k > 0 {
             let layout = &map.chain.levels;
-            let mut coarse = Moments::default();
+            let mut coarse = room(assembler.pool, boxes[k]);
             coarsen(&moments, boxes[k - 1], layout[k - 1].shape, layout[k].halved, boxes[k], &mut coarse, &mut cx);
-            moments = coarse;
+            give_back(assembler.pool, std::mem::replace(&mut moments, coarse));
         }
         let own = output.level_box(k, done.brick);
         if k >= map.first {
@@ -62,7 +64,18 @@ pub fn assemble(
             keep(target, &moments, boxes[k], own);
         }
     }
+    give_back(assembler.pool, moments);
     Ok(())
+}
+
+/// Room for the cells of a box.
+fn room(pool: &Pool, region: Region) -> Moments {
+    Moments { mean: pool.take_numbers(region.voxels()), variance: pool.take_numbers(region.voxels()) }
+}
+
+fn give_back(pool: &Pool, moments: Moments) {
+    pool.put_numbers(moments.mean);
+    pool.put_numbers(moments.variance);
 }
 
 /// Keeps cells of the last level that bricks make for the levels beyond.
@@ -122,14 +135,14 @@ fn base_level(assembler: &Assembler, output: &OutputPlan, map: &MapPlan, done: &
     let wire = &assembler.plan.graph.wires[map.source];
     let value = done.value(map.source);
     let part = region.shift(output.region.lo);
-    let mut moments = Moments::default();
+    let mut moments = room(assembler.pool, region);
     match &value.comps[0] {
         Comp::Voxels(_) => base(value.view(0, part), wire.affine, wire.missing, &mut moments),
         Comp::Const(v) => {
             let missing = v.is_nan() || wire.missing.is_some_and(|m| m as f64 == *v);
             let (mean, variance) = if missing { (f64::NAN, f64::NAN) } else { (wire.affine.apply(*v), 0.0) };
-            moments.mean.resize(region.voxels(), mean);
-            moments.variance.resize(region.voxels(), variance);
+            moments.mean.fill(mean);
+            moments.variance.fill(variance);
         }
     }
     moments
