@@ -162,3 +162,74 @@ fn what_masked_voxels_hold_is_no_saliency() {
     assert!((largest - 1.0).abs() < 1e-6, "{largest}");
     assert_eq!(o[[10, 6, 29]], 0.5);
 }
+
+/// Levels of a variance beside a mean a hundred thousand times larger than the spread, whose f32 hides a part of it.
+#[test]
+fn levels_of_a_variance_pool_unrounded_means() {
+    let shape = [16, 12, 20];
+    let value = |z: usize, y: usize, x: usize| 1e6 + (hash(5, ((z * 64 + y) * 64 + x) as u64) % 64) as f64 / 8.0;
+    let dir = tempfile::tempdir().unwrap();
+    let floats: Vec<f32> = fill(shape, |z, y, x| value(z, y, x) as f32);
+    write_npy(&dir.path().join("floats.npy"), "<f4", shape, &f32_bytes(&floats));
+    let counts: Vec<u16> = fill(shape, |z, y, x| 65000 + (value(z, y, x) as u64 % 3) as u16);
+    write_npy(&dir.path().join("counts.npy"), "<u2", shape, &u16_bytes(&counts));
+    let volumes = [
+        ("floats", floats.iter().map(|v| *v as f64).collect::<Vec<_>>()),
+        ("counts", counts.iter().map(|v| *v as f64).collect()),
+    ];
+    for (input, voxels) in &volumes {
+        for (name, stage, reach) in [("box", "op = 'box'\nradius = 1", 1), ("bell", "op = 'gaussian'\nsigma = 0.6", 2)]
+        {
+            let weight = |d: i64| if name == "box" { 1.0 } else { (-(d * d) as f64 / 0.72).exp() };
+            let windows = fill(shape, |z, y, x| moments(voxels, shape, [z, y, x], reach, &weight));
+            for channel in ["variance", "std"].into_iter().filter(|c| *c == "variance" || name == "box") {
+                let text = format!(
+                    "[run]\nbrick = 8\n[input.v]\npath = '{input}.npy'\n[stage.s]\n{stage}\ninput = 'v'\n[output.o]\n\
+                     path = 'o.zarr'\nfrom = 's.{channel}'\nreduce = 'moments'\nchunk = 4\nlevels = 3\n"
+                );
+                run(dir.path(), &text, &[]);
+                let decoded = decode(&dir.path().join("o.zarr"));
+                for level in 1..3 {
+                    let (cells, bits) = &decoded[&format!("level {level} component 0")];
+                    for (c, bits) in bits.iter().enumerate() {
+                        let cell = [c / cells[2] / cells[1], c / cells[2] % cells[1], c % cells[2]];
+                        let variance = pooled(&windows, shape, cell, 1 << level);
+                        let expect = if channel == "std" { variance.sqrt() } else { variance };
+                        let got = f64::from_bits(*bits);
+                        let what = format!("{name}.{channel} of {input}, level {level} cell {cell:?}");
+                        assert!((got - expect).abs() <= 1e-6 * expect, "{what}: {got}, {expect} expected");
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Mean (less the first voxel) and variance of the window about `c`, in two passes.
+fn moments(voxels: &[f64], shape: [usize; 3], c: [usize; 3], reach: i64, weight: &dyn Fn(i64) -> f64) -> [f64; 2] {
+    let edge = 2 * reach as usize + 1;
+    let taps: Vec<(f64, f64)> = fill([edge; 3], |z, y, x| [z, y, x].map(|i| i as i64 - reach))
+        .into_iter()
+        .filter(|d| (0..3).all(|a| (0..shape[a] as i64).contains(&(c[a] as i64 + d[a]))))
+        .map(|d| {
+            let [z, y, x]: [usize; 3] = std::array::from_fn(|a| (c[a] as i64 + d[a]) as usize);
+            (d.map(weight).iter().product(), voxels[(z * shape[1] + y) * shape[2] + x] - voxels[0])
+        })
+        .collect();
+    let total: f64 = taps.iter().map(|t| t.0).sum();
+    let mean = taps.iter().map(|t| t.0 * t.1).sum::<f64>() / total;
+    [mean, taps.iter().map(|t| t.0 * (t.1 - mean).powi(2)).sum::<f64>() / total]
+}
+
+/// Mean of variances plus variance of means of the windows that a cell covers.
+fn pooled(windows: &[[f64; 2]], shape: [usize; 3], cell: [usize; 3], edge: usize) -> f64 {
+    let covered: Vec<[f64; 2]> =
+        fill([edge; 3], |z, y, x| [cell[0] * edge + z, cell[1] * edge + y, cell[2] * edge + x])
+            .into_iter()
+            .filter(|p| (0..3).all(|a| p[a] < shape[a]))
+            .map(|p| windows[(p[0] * shape[1] + p[1]) * shape[2] + p[2]])
+            .collect();
+    let n = covered.len() as f64;
+    let mean = covered.iter().map(|w| w[0]).sum::<f64>() / n;
+    covered.iter().map(|w| w[1] + (w[0] - mean).powi(2)).sum::<f64>() / n
+}

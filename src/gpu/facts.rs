@@ -38,6 +38,9 @@ pub const LEVELS: &str = "no GPU kernel for method \"levels\": runs on the CPU";
 /// Why four moments stay on the CPU: sums of fourth powers take 96 bits, and bounds of their rounding f64.
 pub const MOMENTS4: &str = "no GPU kernel for method \"moments4\", whose guarantee takes f64: runs on the CPU";
 
+/// Why moments for `reduce = "moments"` stay on the CPU, but for bytes.
+pub const UNROUNDED: &str = "no GPU kernel for means in f64, which `reduce = \"moments\"` pools: runs on the CPU";
+
 /// Bricks that are on the GPU's way at once: one is packed, one computes, one is read back and finished.
 pub const SLOTS: u64 = 3;
 

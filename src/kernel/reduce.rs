@@ -147,6 +147,7 @@ impl Cells {
         }
         match (src.value, src.mean) {
             (AnyView::F32(v), Some(AnyView::F32(m))) => rows_of!(v, m),
+            (AnyView::F32(v), Some(AnyView::F64(m))) => rows_of!(v, m),
             (AnyView::F64(v), Some(AnyView::F64(m))) => rows_of!(v, m),
             _ => false,
         }

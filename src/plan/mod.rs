@@ -26,7 +26,7 @@ use crate::config::{Config, Device, Lanes};
 use crate::gpu::passes::Job;
 use crate::gpu::taps::{TapsJob, Wanted};
 use crate::gpu::{GpuFacts, facts};
-use crate::grid::Border;
+use crate::grid::{Border, DType};
 use crate::kernel::window::Needs;
 use crate::stage::WindowChannel;
 use crate::store::VolumeInfo;
@@ -263,7 +263,9 @@ fn placement(
 ) -> Result<(Placement, Option<GpuFacts>)> {
     // Name, whether there is a kernel, whether it asks for exact floats, and what it is.
     let steps = graph.steps.iter().map(|s| {
-        let kernel = gpu_kernel(s, &graph.wires[s.inputs[0]]);
+        let input = &graph.wires[s.inputs[0]];
+        let unrounded = |w: &graph::WireId| graph.wires[*w].dtype == DType::F64 && input.dtype.result() == DType::F32;
+        let kernel = if s.outputs.iter().any(unrounded) { Err(facts::UNROUNDED) } else { gpu_kernel(s, input) };
         (s.stages.join("+"), kernel, exact(graph, s), Work::Step(s))
     });
     let maps = outputs.iter().filter_map(|o| o.map.as_ref().map(|m| (o, m))).map(|(o, m)| {

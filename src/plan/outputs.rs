@@ -1,7 +1,7 @@
 //! What each output holds: wires, element type, mapping, pyramid, and which levels are made where.
 
 use super::graph::{Wire, WireId};
-use super::lower::Lowered;
+use super::lower::{Lowered, UNROUNDED_MEAN};
 use super::{Prepass, PrepassKind};
 use crate::config::{Config, Op, Output, OutputDType, OutputFormat, OutputRange, op_channels};
 use crate::grid::{DType, Region};
@@ -319,8 +319,11 @@ fn component_names(output: &Output, used: &[&Wire], parts: &[(WireId, usize)]) -
 fn mean_beside(lowered: &Lowered, wire: WireId) -> Option<WireId> {
     let wire = &lowered.graph.wires[wire];
     let stage = wire.name.strip_suffix(&format!(".{}", wire.channel))?;
-    let name = format!("{stage}.mean");
-    lowered.graph.wires.iter().position(|w| w.name == name)
+    let named = |channel: &str| {
+        let name = format!("{stage}.{channel}");
+        lowered.graph.wires.iter().position(|w| w.name == name)
+    };
+    named(UNROUNDED_MEAN).or_else(|| named("mean"))
 }
 
 /// What skipped bricks hold, in the output's type.

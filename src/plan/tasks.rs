@@ -1,7 +1,7 @@
 //! Volumes cut into super-blocks (tasks) and bricks.
 //!
-//! A task owns whole shards of level 0 and of as many further levels as fit in about [`TASK_EDGE`] voxels per axis. It
-//! depends on shapes, chunks and shards only, never on bricks, threads or budget, so that a resumed run may change those.
+//! A task owns whole shards of level 0 and of as many further levels as fit in about one of [`TASK_EDGES`] voxels per axis. It
+//! depends on shapes, halos, chunks and shards only, never on bricks, threads or budget, so that a resumed run may change those.
 
 use super::graph::Graph;
 use super::graph::{StepId, WireId, max3};
@@ -11,8 +11,13 @@ use crate::gpu::maps::{MapJob, MapLevel};
 use crate::grid::{Region, Shape};
 use crate::store::LevelLayout;
 
-/// Edge of a task that is aimed at: 512^3 u8 voxels take seconds, so a kill loses little and a marker costs little.
-const TASK_EDGE: usize = 512;
+/// Edges of a task that are aimed at, the first that is small enough: 512^3 u8 voxels take seconds, so that a kill loses little
+/// and a marker costs little, but of a volume of that size nothing would be kept.
+const TASK_EDGES: [usize; 3] = [512, 256, 128];
+/// A task is at most one in so many of the voxels, where files and halos allow it.
+const LEAST_TASKS: usize = 8;
+/// A task's edge is at least so many halos, where it is below the first of [`TASK_EDGES`]: bricks lie inside tasks.
+const HALOS_PER_EDGE: usize = 8;
 /// Levels that every brick makes by itself: bricks are multiples of 2^3 on halved axes. Coarser levels are made in the
 /// second phase from cells of this level, 1/512 of the voxels.
 const BRICK_LEVELS: usize = 3;
@@ -226,13 +231,25 @@ fn fill_group(plan: &Plan, group: &mut Group) {
         }
     }
     let base = lcm3(files, group.align);
-    group.task = task_shape(&outputs, base);
     let shape = group.region.shape();
+    let halo = group.inputs.iter().flat_map(|&w| input_halo(plan, group, w)).max().unwrap_or(0);
+    group.task = choose_task(&outputs, base, shape, halo);
     group.tasks = std::array::from_fn(|a| shape[a].div_ceil(group.task[a]).max(1));
 }
 
-/// Grows a task from the files of level 0 to those of further levels while it stays near [`TASK_EDGE`].
-fn task_shape(outputs: &[&OutputPlan], base: Shape) -> Shape {
+/// The first of [`TASK_EDGES`] that cuts the region into [`LEAST_TASKS`], or the least that the halo allows.
+fn choose_task(outputs: &[&OutputPlan], base: Shape, region: Shape, halo: usize) -> Shape {
+    let allowed = |edge: usize| edge == TASK_EDGES[0] || edge >= HALOS_PER_EDGE * halo;
+    let shapes = TASK_EDGES.into_iter().filter(|&e| allowed(e)).map(|edge| task_shape(outputs, base, edge));
+    let small = |task: &Shape| {
+        let most: usize = (0..3).map(|a| task[a].min(region[a])).product();
+        most * LEAST_TASKS <= region.iter().product()
+    };
+    shapes.clone().find(small).or(shapes.last()).unwrap_or(base)
+}
+
+/// Grows a task from the files of level 0 to those of further levels while it stays near `edge`.
+fn task_shape(outputs: &[&OutputPlan], base: Shape, edge: usize) -> Shape {
     let mut task = base;
     for k in 1..=BRICK_LEVELS {
         let mut next = task;
@@ -241,13 +258,13 @@ fn task_shape(outputs: &[&OutputPlan], base: Shape) -> Shape {
             let file = output.commit_shape();
             next = lcm3(next, std::array::from_fn(|a| file[a] * factor[a]));
         }
-        if (0..3).any(|a| next[a] > TASK_EDGE.max(base[a])) {
+        if (0..3).any(|a| next[a] > edge.max(base[a])) {
             break;
         }
         task = next;
     }
     // Flat files and small chunks: as many as come near the edge.
-    std::array::from_fn(|a| task[a] * (TASK_EDGE / task[a]).max(1))
+    std::array::from_fn(|a| task[a] * (edge / task[a]).max(1))
 }
 
 /// Input wires that steps and sinks read.

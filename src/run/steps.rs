@@ -292,21 +292,27 @@ impl<'a> Engine<'a> {
                 moments4::moments4(src.view(), codes.as_ref(), &params, *ties, src.at, &mut outs, cx);
             }
             StepKind::Gaussian { sigma, channels } => {
-                let (mut mean, mut variance) = (None, None);
+                let (mut mean, mut unrounded, mut variance) = (None, None, None);
                 for (channel, value) in channels.iter().zip(outputs) {
-                    match channel {
-                        Moment::Mean => mean = Some(view_mut(value, c)),
-                        Moment::Variance => variance = Some(view_mut(value, c)),
+                    match (channel, value.dtype) {
+                        (Moment::Mean, dtype) if dtype != src.view().dtype().result() => {
+                            unrounded = Some(view_mut(value, c))
+                        }
+                        (Moment::Mean, _) => mean = Some(view_mut(value, c)),
+                        (Moment::Variance, _) => variance = Some(view_mut(value, c)),
                     }
                 }
+                let Windowed { affine, missing, at, .. } = *src;
+                if let (Some(_), Some(_)) = (&mean, &unrounded) {
+                    gaussian::gaussian(src.view(), *sigma, affine, missing, at, mean.take(), None, cx);
+                }
+                let mean = mean.or(unrounded);
                 match self.lane(id, region) {
                     Some(gpu) => {
-                        let done = gpu.gaussian(src.view(), *sigma, src.affine, src.at, mean, variance, cx);
+                        let done = gpu.gaussian(src.view(), *sigma, affine, at, mean, variance, cx);
                         done.map_err(|e| self.gpu_failed(id, &e))?;
                     }
-                    None => {
-                        gaussian::gaussian(src.view(), *sigma, src.affine, src.missing, src.at, mean, variance, cx);
-                    }
+                    None => gaussian::gaussian(src.view(), *sigma, affine, missing, at, mean, variance, cx),
                 }
             }
             _ => unreachable!("only window kernels come here"),

@@ -45,7 +45,7 @@ const LIT: &str = r#"
 threads = 2
 brick = [16, 32, 32]
 [input.vol]
-path = "vol.npy"
+path = "bytes.npy"
 [stage.stats]
 op = "box"
 input = "vol"
@@ -53,12 +53,12 @@ radius = [2, 3, 5]
 [stage.tf]
 op = "transfer"
 input = "vol"
-points = [[0, 0.0, 0.1, 0.2, 0.3], [20000, 0.4, 0.9, 0.5, 0.0], [65535, 1.0, 1.0, 0.8, 0.4]]
+points = [[0, 0.0, 0.1, 0.2, 0.3], [80, 0.4, 0.9, 0.5, 0.0], [255, 1.0, 1.0, 0.8, 0.4]]
 [stage.dim]
 op = "opacity_modulation"
 input = "tf.opacity"
 by = "stats.variance"
-sigma_max2 = 3e8
+sigma_max2 = 4600
 [stage.cut]
 op = "window"
 input = "dim"
@@ -85,7 +85,7 @@ path = "out/std.zarr"
 from = "stats.std"
 reduce = "moments"
 dtype = "u16"
-range = [0, 40000]
+range = [0, 160]
 chunk = 4
 shard = 8
 [output.least]
@@ -291,7 +291,6 @@ chunk = 8
 [output.var]
 path = "out/var.zarr"
 from = "mirrored.variance"
-reduce = "moments"
 chunk = 8
 [output.held]
 path = "out/held.zarr"

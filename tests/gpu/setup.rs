@@ -19,10 +19,12 @@ pub fn lane() -> &'static str {
 
 pub const CPU: &str = "run.device='cpu'";
 
-/// A folder with `vol.npy` of these voxels.
+/// A folder with `vol.npy` of these voxels, and `bytes.npy` of their high bytes.
 pub fn folder_of(voxels: &[u16], shape: Shape) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(voxels));
+    let high: Vec<u8> = voxels.iter().map(|v| (v >> 8) as u8).collect();
+    write_npy(&dir.path().join("bytes.npy"), "|u1", shape, &high);
     dir
 }
 

@@ -18,10 +18,10 @@ use crate::grid::{Affine, AnyView, AnyViewMut, DType, Shape};
 use tiles::{Job, Out, Pass, Tiling};
 
 /// Separable Gaussian of `sigma` voxels per axis, truncated at `ceil(3 sigma)`, weights renormalised to the voxels that
-/// exist (inside `src`, not NaN, not `missing`). `mean` and `variance` have `src.dtype().result()`; scaled by `affine`. A
+/// exist (inside `src`, not NaN, not `missing`). `mean` and `variance` have `src.dtype().result()`, or `mean` f64; scaled by `affine`. A
 /// missing centre gives NaN. Panics if extents or types disagree.
 ///
-/// Means of types whose result is f32 are computed in f32 (within 4e-7 of the window's range), all else in f64.
+/// Means in f32 are computed in f32 (within 4e-7 of the window's range), all else in f64.
 #[allow(clippy::too_many_arguments)]
 pub fn gaussian(
     src: AnyView,
@@ -44,7 +44,7 @@ pub fn gaussian(
     let job = Job { src, missing, affine, at, dst, radius: radius(sigma, from), sigma, level: cx.level };
     let bytes = cx.scratch.take(scratch_bytes(src.dtype(), from, dst, sigma, true));
     let mut finite = true;
-    if src.dtype().result() == DType::F32 {
+    if src.dtype().result() == DType::F32 && !mean.as_ref().is_some_and(|m| m.dtype() == DType::F64) {
         if let Some(mean) = &mut mean {
             finite &= job.run::<f32>(bytes, Pass::Mean, Out { mean: Some(mean), variance: None });
         }

@@ -175,9 +175,9 @@ pub(super) fn signed_root(v: f64) -> f64 {
 
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
-fn moments_inner<S: Voxel>(
+fn moments_inner<S: Voxel, M: Voxel>(
     variance: &[&[S]],
-    mean: &[&[S]],
+    mean: &[&[M]],
     std: bool,
     halve_x: bool,
     counts: &[f64],
@@ -190,13 +190,13 @@ fn moments_inner<S: Voxel>(
         false => vertical(variance, line, S::to_f64, add),
     }
     pairs(line, halve_x, inner, add);
-    vertical(mean, line, S::to_f64, add);
+    vertical(mean, line, M::to_f64, add);
     pairs(line, halve_x, value, add);
     // The cells' means, for as long as it takes to spread them, where the deviations go.
     means_inner(value, counts, halve_x, between, up);
     let n = line.len();
     let up = &up[..n];
-    let square = |v: S, x: usize| (v.to_f64() - up[x]) * (v.to_f64() - up[x]);
+    let square = |v: M, x: usize| (v.to_f64() - up[x]) * (v.to_f64() - up[x]);
     match *mean {
         [a] => (0..n).for_each(|x| line[x] = square(a[x], x)),
         [a, b] => {
@@ -217,8 +217,8 @@ fn moments_inner<S: Voxel>(
 crate::multiversion! {
     /// Moments straight from up to four rows of voxels that all count; false where that gave a NaN. The arrays are rows
     /// of scratch (voxels), then value, inner and between (cells).
-    pub fn moments[S: Voxel](
-        variance: &[&[S]], mean: &[&[S]], std: bool, halve_x: bool, counts: &[f64],
+    pub fn moments[S: Voxel, M: Voxel](
+        variance: &[&[S]], mean: &[&[M]], std: bool, halve_x: bool, counts: &[f64],
         scratch: [&mut [f64]; 2], out: [&mut [f64]; 3],
     ) -> bool = moments_inner;
 }

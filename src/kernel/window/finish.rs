@@ -50,6 +50,17 @@ fn moments_inner<T: Code, X1: RowSum, X2: Acc, O: Voxel>(
             WindowChannel::Std => numerators!(s1, s2, n, rows.width, |i, m| {
                 out[i] = O::from_f64(a.abs() * (m * inverse[i] * inverse[i]).sqrt());
             }),
+            // Unscaled: from the exact sum, so that halves between two f32 go to the even one.
+            WindowChannel::Moment2 if affine.is_identity() => {
+                let few = rows.most as u128 * (T::TOP as u128).pow(2) < 1 << 52;
+                for i in 0..rows.len {
+                    let squares = squares(s1[i].low(), s2[i].low(), n[i], offset as u64);
+                    out[i] = O::from_f64(match few {
+                        true => exact_mean(squares, n[i], inverse[i], 0.0),
+                        false => long_mean(squares, n[i], 0.0),
+                    });
+                }
+            }
             _ => numerators!(s1, s2, n, rows.width, |i, m| {
                 let mean = match exact {
                     true => exact_mean(s1[i], n[i], inverse[i], offset),
@@ -60,4 +71,11 @@ fn moments_inner<T: Code, X1: RowSum, X2: Acc, O: Voxel>(
             }),
         }
     }
+}
+
+/// Sum of the squares of stored values, which are codes less `offset`: below 2^63, so what wraps on the way comes back.
+#[inline(always)]
+fn squares(s1: u64, s2: u64, n: u32, offset: u64) -> u64 {
+    let shift = (n as u64 * offset).wrapping_mul(offset);
+    s2.wrapping_add(shift).wrapping_sub(2u64.wrapping_mul(offset).wrapping_mul(s1))
 }

@@ -229,7 +229,7 @@ fn power_voxel<T: Voxel, A: Sum>(v: T, lo: T, hi: T, s: A, n: f64, polarity: Pol
         return polarity.constant;
     }
     if !lo.is_finite() || !hi.is_finite() {
-        return infinite(v, lo, hi, polarity.flipped, 0.0);
+        return infinite(v, lo, hi, polarity.flipped, [1.0, 0.0]);
     }
     // Halves: the range of f64 values may exceed the largest of them.
     let (below, above, range) = (0.5 * v - 0.5 * lo, 0.5 * hi - 0.5 * v, 0.5 * hi - 0.5 * lo);
@@ -245,8 +245,8 @@ fn power_voxel<T: Voxel, A: Sum>(v: T, lo: T, hi: T, s: A, n: f64, polarity: Pol
 }
 
 /// Openness of a window that holds an infinity and is not constant: 1 at +inf, 0 at -inf; else `above` where there is
-/// only +inf, `1 - above` where there is only -inf, NaN where both meet.
-fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, above: f32) -> f32 {
+/// only +inf, `below` where there is only -inf, NaN where both meet.
+fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, [below, above]: [f32; 2]) -> f32 {
     let (v, lo, hi) = if flipped { (-v, -hi, -lo) } else { (v, lo, hi) };
     if v == f64::INFINITY {
         1.0
@@ -257,7 +257,7 @@ fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, above: f32) -> f32 {
     } else if hi.is_infinite() {
         above
     } else {
-        1.0 - above
+        below
     }
 }
 
@@ -288,7 +288,7 @@ pub fn beta_row<T: Voxel, A: Sum>(
     for i in 0..out.len() {
         let (v, lo, hi) = (v[i].to_f64(), lo[i].to_f64(), hi[i].to_f64());
         if lo != hi && (lo.is_infinite() || hi.is_infinite()) {
-            out[i] = infinite(v, lo, hi, polarity.flipped, 0.0);
+            out[i] = infinite(v, lo, hi, polarity.flipped, [1.0, 0.0]);
         }
     }
 }
@@ -354,7 +354,13 @@ pub fn spread_row<T: Voxel, A: Sum>(
         for i in 0..out.len() {
             let (v, lo, hi) = (v[i].to_f64(), lo[i].to_f64(), hi[i].to_f64());
             if lo != hi && (lo.is_infinite() || hi.is_infinite()) {
-                out[i] = infinite(v, lo, hi, polarity.flipped, if kind == Spread::Literal { 1.0 } else { 0.0 });
+                // Beyond the mean by as much as the spread: the limit hangs on how many infinities there are.
+                let limits = match kind {
+                    Spread::Gaussian => [f32::NAN; 2],
+                    Spread::Chebyshev => [f32::NAN, 0.0],
+                    Spread::Literal => [f32::NAN, 1.0],
+                };
+                out[i] = infinite(v, lo, hi, polarity.flipped, limits);
             }
         }
     }

@@ -75,9 +75,9 @@ impl Place {
 /// Missing voxels (NaN, or `params.missing` for integers) do not count. Where the centre is missing, float outputs are
 /// NaN and integer outputs 0. An infinity changes only the windows that hold it: minimum, maximum and mean follow IEEE,
 /// variance and std are NaN, the second moment is +inf. Openness with infinities in a window that is not constant: 1 at
-/// a centre of +inf, 0 at -inf; at a finite centre the limit of `cdf_power` (0 with +inf, 1 with -inf in the window),
-/// and for the methods that use the spread an infinitely distant mean (`gaussian_cdf` and `chebyshev` 0 with +inf and 1
-/// with -inf, `chebyshev_literal` the reverse); NaN where both infinities meet. `solid_low` swaps the signs.
+/// a centre of +inf, 0 at -inf; at a finite centre the limit of the formula as the infinity is approached, where that hangs on
+/// nothing else: `cdf_power` 0 with +inf and 1 with -inf in the window, `chebyshev` 0 and `chebyshev_literal` 1 with +inf; NaN for
+/// the other methods that use the spread, and where both infinities meet. `solid_low` swaps the signs.
 ///
 /// Panics if extents or types disagree, or if a window could hold 2^31 voxels.
 pub fn window(src: AnyView, params: &WindowParams, place: Place, outs: &mut [WindowOut], cx: &mut Context) {
@@ -137,6 +137,8 @@ fn check(src: AnyView, params: &WindowParams, at: [usize; 3], dst: Shape, outs: 
             WindowChannel::Openness(..) => {
                 given == dtype.result() || given == DType::U8 && dtype.result() == DType::F32
             }
+            // What pools levels takes means unrounded.
+            WindowChannel::Mean => given == dtype.result() || given == DType::F64,
             _ => given == dtype.result(),
         };
         assert!(fits, "{:?} of {dtype} is not written as {given}", out.channel);

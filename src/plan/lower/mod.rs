@@ -12,9 +12,13 @@ use super::{Prepass, lengths};
 use crate::config::{Config, Input, Modulation, ObscuranceOp, Op, Place, Ref, StageNode, op_channels};
 use crate::grid::Border;
 use crate::kernel::gaussian;
+use crate::stage::Reduce;
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 use ops::box_channel;
+
+/// A mean that levels are pooled with, in f64: rounded to f32 it would hide small spreads of large means. No name of a config.
+pub const UNROUNDED_MEAN: &str = "unrounded mean";
 
 /// What lowering makes.
 #[derive(Debug, Default)]
@@ -54,6 +58,9 @@ pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
     for output in &config.outputs {
         for from in &output.from {
             lowering.want(from, &output.place)?;
+            if output.reduce == Some(Reduce::Moments) {
+                lowering.want_means(from, &output.place)?;
+            }
         }
     }
     let stages: Vec<usize> = (0..config.stages.len()).filter(|&s| !lowering.wanted[s].is_empty()).collect();
@@ -117,12 +124,6 @@ impl Lowering<'_> {
         if !self.wanted[stage].contains(&channel) {
             self.wanted[stage].push(channel);
         }
-        // Levels of a variance pool the means as well.
-        let companion = ["variance", "std"].contains(&channel)
-            && op_channels(self.config.stages[stage].op.word()).contains(&"mean");
-        if companion && !self.wanted[stage].contains(&"mean") {
-            self.wanted[stage].push("mean");
-        }
         let node = &self.config.stages[stage];
         for (key, input) in node.reads() {
             // A colour bleeds into the channel rgb alone.
@@ -134,6 +135,19 @@ impl Lowering<'_> {
             if unseen && !instead {
                 self.want(input, &node.place)?;
             }
+        }
+        Ok(())
+    }
+
+    /// Levels of a variance pool the means as well.
+    fn want_means(&mut self, reference: &Ref, place: &Place) -> Result<()> {
+        let Target::Stage(stage, _) = self.target(reference, place)? else { return Ok(()) };
+        let (Op::Box { input, .. } | Op::Gaussian { input, .. }) = &self.config.stages[stage].op else { return Ok(()) };
+        // f32 holds the mean of a few bytes well enough beside any variance that they can have, and so does the GPU.
+        let bytes = matches!(self.target(input, place)?, Target::Input(i) if self.infos[i].dtype.size() == 1);
+        let channel = if bytes { "mean" } else { UNROUNDED_MEAN };
+        if !self.wanted[stage].contains(&channel) {
+            self.wanted[stage].push(channel);
         }
         Ok(())
     }
@@ -212,7 +226,7 @@ impl Lowering<'_> {
                 let src = self.wire(input, place)?;
                 let sigma = lengths::sigma(sigma, self.lattice(src), &key("sigma"))?;
                 let channels =
-                    wanted.iter().map(|c| if *c == "mean" { Moment::Mean } else { Moment::Variance }).collect();
+                    wanted.iter().map(|c| if *c == "variance" { Moment::Variance } else { Moment::Mean }).collect();
                 let kind = StepKind::Gaussian { sigma, channels };
                 self.push_step(index, node, kind, vec![src], gaussian::reach(sigma), node.border, wanted)
             }

@@ -2,7 +2,7 @@
 
 use super::super::graph::*;
 use super::super::{Prepass, PrepassKind, lengths};
-use super::{Lowering, Target};
+use super::{Lowering, Target, UNROUNDED_MEAN};
 use crate::brick::Voxels;
 use crate::config::{ObscuranceOp, Op, Place, Ref, StageNode};
 use crate::grid::{AnyViewMut, Border, ViewMut};
@@ -206,7 +206,7 @@ impl Lowering<'_> {
 /// The window channel of a box statistic.
 pub(super) fn box_channel(name: &str) -> WindowChannel {
     match name {
-        "mean" => WindowChannel::Mean,
+        "mean" | UNROUNDED_MEAN => WindowChannel::Mean,
         "min" => WindowChannel::Min,
         "max" => WindowChannel::Max,
         "variance" => WindowChannel::Variance,

@@ -2,7 +2,7 @@
 
 use super::super::graph::*;
 use super::super::{Prepass, PrepassKind};
-use super::Lowering;
+use super::{Lowering, UNROUNDED_MEAN};
 use crate::config::{Op, StageNode, Where, WhereRule};
 use crate::grid::{Affine, Border, DType};
 use crate::kernel::mask;
@@ -139,6 +139,8 @@ impl Lowering<'_> {
         let extreme = extreme && !src.beyond(node.border).1;
         let dtype = if extreme {
             src.dtype
+        } else if channel == UNROUNDED_MEAN {
+            DType::F64
         } else {
             inputs.iter().fold(DType::F32, |d, &w| {
                 if self.out.graph.wires[w].dtype.result() == DType::F64 { DType::F64 } else { d }
