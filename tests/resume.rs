@@ -12,7 +12,7 @@ use occlude::run::{Cancel, Progress, RunOptions, Session, Silent};
 
 const SHAPE: [usize; 3] = [24, 40, 2300];
 
-/// Nine tasks, shards that tasks share on the coarse levels, a second phase, a flat file and a pre-pass.
+/// Five tasks, shards that tasks share on the coarse levels, a second phase, a flat file and a pre-pass.
 const CONFIG: &str = r#"
 [run]
 threads = 2
@@ -126,7 +126,7 @@ fn small_volumes_are_cut_into_tasks() {
     let far = "op = 'obscurance'\nmax_distance = 64";
     for (stage, output, tasks) in [
         (near, "path = 'o.zarr'\nchunk = 32\nshard = 64\nlevels = 1", 27),
-        (near, "path = 'o.raw'", 27),
+        (near, "path = 'o.raw'", 5),
         // Shards of 256 voxels, of which those of the coarser levels are shared.
         (near, "path = 'o.zarr'", 8),
         (far, "path = 'o.raw'", 1),
@@ -160,7 +160,7 @@ fn done_tasks_are_never_computed_again_and_resuming_may_change_bricks_and_thread
     let options = RunOptions { cancel: cancel.clone(), ..Default::default() };
     let session = occlude::run::Session::open(&config, &options, &occlude::run::Silent).unwrap();
     let tasks = session.open_tasks();
-    assert_eq!(tasks.len(), 9);
+    assert_eq!(tasks.len(), 5);
     session.run_task(tasks[3]).unwrap();
     session.run_task(tasks[0]).unwrap();
     drop(session);
@@ -267,7 +267,7 @@ fn a_full_disk_keeps_what_was_finished_and_resumes_when_there_is_room() {
     let expected = decoded(reference.path());
     let dir = folder();
     let out = dir.path().join("out");
-    // Room for some of the nine tasks (their files take about 17 MiB), and for nothing but the first files.
+    // Room for some of the five tasks (their files take about 17 MiB), and for nothing but the first files.
     for size in ["12m", "6m"] {
         let Some(disk) = Disk::mount(&out, &format!("size={size}")) else {
             eprintln!("SKIPPED: no file system can be mounted here (root is needed), so no disk can run full");

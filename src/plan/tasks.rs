@@ -13,7 +13,7 @@ use crate::store::LevelLayout;
 
 /// Edges of a task that are aimed at, the first that is small enough: 512^3 u8 voxels take seconds, so that a kill loses little
 /// and a marker costs little, but of a volume of that size nothing would be kept.
-const TASK_EDGES: [usize; 3] = [512, 256, 128];
+const TASK_EDGES: [usize; 5] = [512, 256, 128, 64, 32];
 /// A task is at most one in so many of the voxels, where files and halos allow it.
 const LEAST_TASKS: usize = 8;
 /// A task's edge is at least so many halos, where it is below the first of [`TASK_EDGES`]: bricks lie inside tasks.
@@ -230,8 +230,12 @@ fn fill_group(plan: &Plan, group: &mut Group) {
             files = lcm3(files, scaled(output.commit_shape()));
         }
     }
-    let base = lcm3(files, group.align);
+    let mut base = lcm3(files, group.align);
     let shape = group.region.shape();
+    if outputs.iter().any(|o| !o.is_zarr()) {
+        // Planes of a flat file are written in one go; parts of rows take a call each.
+        (1..3).for_each(|a| base[a] = shape[a].min(TASK_EDGES[0]).next_multiple_of(base[a]));
+    }
     let halo = group.inputs.iter().flat_map(|&w| input_halo(plan, group, w)).max().unwrap_or(0);
     group.task = choose_task(&outputs, base, shape, halo);
     group.tasks = std::array::from_fn(|a| shape[a].div_ceil(group.task[a]).max(1));

@@ -69,12 +69,13 @@ impl Journal {
         os::sync_dir(dir).map_err(fail)
     }
 
-    /// Marks a task as done; everything that it wrote must be durable already.
-    pub fn done(&self, task: usize) -> Result<()> {
+    /// Marks tasks as done; everything that they wrote must be durable already.
+    pub fn done(&self, tasks: &[usize]) -> Result<()> {
         let mut file = self.file.lock().unwrap_or_else(|e| e.into_inner());
-        file.write_all(format!("done {task} ok\n").as_bytes())
+        let lines: String = tasks.iter().map(|task| format!("done {task} ok\n")).collect();
+        file.write_all(lines.as_bytes())
             .and_then(|()| file.sync_data())
-            .map_err(|e| Error::file(&self.path, format!("cannot mark task {task} as done: {e}")))
+            .map_err(|e| Error::file(&self.path, format!("cannot mark the tasks {tasks:?} as done: {e}")))
     }
 }
 
@@ -126,12 +127,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let head = header("h", &[], 3, &json!({}), &[vec![f64::NAN, 0.1]]);
         let journal = Journal::open(dir.path(), &head, false).unwrap();
-        journal.done(2).unwrap();
+        journal.done(&[2]).unwrap();
         drop(journal);
         let log = dir.path().join(TASKS);
         OpenOptions::new().append(true).open(&log).unwrap().write_all(b"done 1").unwrap(); // of `done 12 ok`
         assert_eq!(Journal::read(dir.path()).unwrap().done, [2]);
-        Journal::open(dir.path(), &head, true).unwrap().done(0).unwrap();
+        Journal::open(dir.path(), &head, true).unwrap().done(&[0]).unwrap();
         let earlier = Journal::read(dir.path()).unwrap();
         assert_eq!(earlier.done, [2, 0]);
         assert_eq!(globals(&earlier.header)[0][1], 0.1);

@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 
 use super::assemble::{Assembler, Item, Target, TaskSlot};
 use super::cache::{ChunkCache, Uses};
+use super::commits::Commits;
 use super::compute::Finished;
 use super::journal::{self, Journal};
 use super::metrics::Metrics;
@@ -271,13 +272,20 @@ impl<'a> Session<'a> {
         let assembler = Assembler { plan: &self.plan, group, targets, pool, level, gpu };
         let deliver =
             |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
-        let write = |work: Work, items: Vec<Item>| self.write(group, &slots[work.slot], items, only.is_none());
+        let commits = Commits::new();
+        let commit = |tasks: &[(usize, Region)]| self.commit(group, tasks, only.is_none());
+        let write = |work: Work, items: Vec<Item>| {
+            let slot = &slots[work.slot];
+            if self.write(slot, items)? { commits.add(slot.number, slot.region, commit) } else { Ok(()) }
+        };
         let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
         let tick = || {
             let (bricks, voxels) = self.metrics.done();
             self.tick(&group.brick, [voxels, self.plan.voxels(), bricks, total], "compute");
         };
-        self.stream(&engine, &program, &group.brick, &work, &self.metrics, &deliver, &write, &tick)
+        let streamed = self.stream(&engine, &program, &group.brick, &work, &self.metrics, &deliver, &write, &tick);
+        // What was finished is kept, whatever ended the stream; the first error is the one to tell.
+        streamed.and(commits.settle(commit))
     }
 
     fn engine(&self) -> Engine<'_> {
@@ -286,25 +294,31 @@ impl<'a> Session<'a> {
         engine
     }
 
-    /// Stores a brick's chunks; after the last brick of a task, commits it, and marks it where it is `whole`.
-    fn write(&self, group: &Group, slot: &TaskSlot, items: Vec<Item>, whole: bool) -> Result<()> {
+    /// Stores a brick's chunks; true after the last brick of a task.
+    fn write(&self, slot: &TaskSlot, items: Vec<Item>) -> Result<bool> {
         for item in items {
             let target = self.targets[item.output].as_ref().expect("bricks go to open outputs");
             let bytes = target.sink.put(item.dataset, item.component, item.region, item.chunk)?;
             self.metrics.bytes_written(bytes);
         }
-        if slot.written() {
-            let start = Instant::now();
+        Ok(slot.written())
+    }
+
+    /// Makes tasks durable, and marks them where they are `whole`.
+    fn commit(&self, group: &Group, tasks: &[(usize, Region)], whole: bool) -> Result<()> {
+        let start = Instant::now();
+        for &(_, region) in tasks {
             for &o in &group.outputs {
                 if let Some(target) = &self.targets[o] {
-                    outputs::commit_task(group, &self.plan.outputs[o], target, slot.region)?;
+                    outputs::commit_task(group, &self.plan.outputs[o], target, region)?;
                 }
             }
-            if let Some(journal) = self.journal.as_ref().filter(|_| whole) {
-                journal.done(slot.number)?;
-            }
-            self.trace.span("commit", start, &[("task", slot.number.to_string())]);
         }
+        let numbers: Vec<usize> = tasks.iter().map(|t| t.0).collect();
+        if let Some(journal) = self.journal.as_ref().filter(|_| whole) {
+            journal.done(&numbers)?;
+        }
+        self.trace.span("commit", start, &[("tasks", format!("{numbers:?}"))]);
         Ok(())
     }
 
