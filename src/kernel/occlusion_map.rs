@@ -2,8 +2,8 @@
 //!
 //! Blurring and halving an axis are one pass here: a cell pools the two blurred cells that it covers, which is a pool of six
 //! finer cells with weights (1 5 10 10 5 1)/32 away from the ends. Variances are pooled as mean of variances plus variance
-//! of means, which is what pooling twice gives too. Axes follow each other (z, y, x); an axis passes over NaN cells: the five
-//! taps of each blurred cell, and the two blurred cells, are renormalised to what is valid.
+//! of means, which is what pooling twice gives too. Axes follow each other (z, y, x). Where a window holds a NaN cell, axes do
+//! not part: such cells are made anew from their windows, the 125 taps of each blurred cell renormalised to what is valid.
 
 use super::Context;
 use super::values::{blocks, load_any};
@@ -97,6 +97,15 @@ pub fn coarsen(
             steps.along_x(cx.level, from, [&mut *split_m, &mut *split_v], out);
         }
     }
+    if dst.variance.iter().all(|v| v.is_finite()) {
+        return;
+    }
+    let fine = Fine { cells: fine, region: fine_box, volume: fine_volume };
+    for (i, cell) in coarse_box.iter().enumerate() {
+        if !(dst.mean[i].is_finite() && dst.variance[i].is_finite()) {
+            [dst.mean[i], dst.variance[i]] = fine.pool_valid(halve, cell);
+        }
+    }
 }
 
 /// Where the needed box lies in the buffer of the finer level.
@@ -120,35 +129,77 @@ struct Steps {
     coarse: [i64; 3],
 }
 
-/// Weights of fine cells 2i - 2 .. 2i + 3 in coarse cell i of an axis of `n` fine cells, where `valid` are valid: each of
-/// the blurred cells 2i and 2i + 1 pools its five taps, and the cell pools those of the two that exist and are valid.
-fn six_weights(i: i64, n: i64, valid: [bool; 6]) -> [f64; 6] {
-    const TAPS: [f64; 5] = [1.0, 4.0, 6.0, 4.0, 1.0];
+const TAPS: [f64; 5] = [1.0, 4.0, 6.0, 4.0, 1.0];
+
+/// Weights of the fine cells 2i - 2 .. 2i + 3 in coarse cell `i` of an axis of `n` fine cells: each of the blurred cells 2i and
+/// 2i + 1 pools those of its five taps that exist, and the cell pools those of the two that exist.
+pub fn full_weights(i: i64, n: i64) -> [f64; 6] {
     let mut blurred = [[0.0; 6]; 2];
     let mut found = 0.0;
-    for (j, blurred) in blurred.iter_mut().enumerate() {
-        if 2 * i + j as i64 >= n {
-            continue;
-        }
-        let mut total = 0.0;
-        for (k, tap) in TAPS.iter().enumerate() {
-            let cell = 2 * i - 2 + (j + k) as i64;
-            if (0..n).contains(&cell) && valid[j + k] {
-                blurred[j + k] = *tap;
-                total += *tap;
-            }
-        }
-        if total > 0.0 {
-            blurred.iter_mut().for_each(|w| *w /= total);
-            found += 1.0;
-        }
+    for (j, blurred) in blurred.iter_mut().enumerate().filter(|(j, _)| 2 * i + (*j as i64) < n) {
+        let exists = |k: &usize| (0..n).contains(&(2 * i - 2 + (j + k) as i64));
+        let total: f64 = (0..5).filter(exists).map(|k| TAPS[k]).sum();
+        (0..5).filter(exists).for_each(|k| blurred[j + k] = TAPS[k] / total);
+        found += 1.0;
     }
-    std::array::from_fn(|k| if found > 0.0 { (blurred[0][k] + blurred[1][k]) / found } else { 0.0 })
+    std::array::from_fn(|k| (blurred[0][k] + blurred[1][k]) / found)
 }
 
-/// Weights of the six finer cells in coarse cell `i` of an axis of `n` fine cells, all of them valid.
-pub fn full_weights(i: i64, n: i64) -> [f64; 6] {
-    six_weights(i, n, [true; 6])
+/// Cells of a level and where they lie in it.
+struct Fine<'a> {
+    cells: &'a Moments,
+    region: Region,
+    volume: Shape,
+}
+
+impl Fine<'_> {
+    /// Mean and variance of a cell; NaN means where it is missing.
+    fn at(&self, cell: [i64; 3]) -> [f64; 2] {
+        let (shape, at) = (self.region.shape(), std::array::from_fn(|a| (cell[a] - self.region.lo[a]) as usize));
+        let [z, y, x]: [usize; 3] = at;
+        let i = (z * shape[1] + y) * shape[2] + x;
+        [self.cells.mean[i], self.cells.variance[i]]
+    }
+
+    /// The cell `coarse` of the next level over the valid cells of its windows: each blurred cell that it covers by its taps, then
+    /// those that have any, alike. NaN where there is none.
+    fn pool_valid(&self, halve: [bool; 3], coarse: [i64; 3]) -> [f64; 2] {
+        // First blurred cell, and how many there are; of an axis that stays, the cell itself, unblurred.
+        let first: [i64; 3] = std::array::from_fn(|a| if halve[a] { 2 * coarse[a] } else { coarse[a] });
+        let end: [i64; 3] = std::array::from_fn(|a| (first[a] + 1 + i64::from(halve[a])).min(self.volume[a] as i64));
+        let reach = halve.map(|h| if h { 2 } else { 0 });
+        let window = Region::new(first, end).grow(reach).clip(&Region::whole(self.volume));
+        if window.iter().all(|cell| self.at(cell)[0].is_nan()) {
+            return [f64::NAN; 2];
+        }
+        let blurred = Region::new(first, end).iter().filter_map(|b| {
+            let taps = Region::new(b, b.map(|i| i + 1)).grow(reach).clip(&Region::whole(self.volume));
+            pool(|| {
+                taps.iter().map(|cell| {
+                    let weight = |a: usize| if halve[a] { TAPS[(cell[a] - b[a] + 2) as usize] } else { 1.0 };
+                    ((0..3).map(weight).product(), self.at(cell))
+                })
+            })
+        });
+        let mut found = [[0.0; 2]; 8];
+        let count = blurred.zip(&mut found).map(|(b, to)| *to = b).count();
+        pool(|| found[..count].iter().map(|b| (1.0, *b))).unwrap_or([f64::NAN; 2])
+    }
+}
+
+/// Mean and variance of weighted cells that are valid; `None` where none is. Relative to the first of them, so that constants stay
+/// what they are, except where an infinity stands.
+fn pool<I: Iterator<Item = (f64, [f64; 2])>>(cells: impl Fn() -> I) -> Option<[f64; 2]> {
+    let valid = || cells().filter(|(_, [m, _])| !m.is_nan());
+    let (_, [pivot, _]) = valid().next()?;
+    let total: f64 = valid().map(|(w, _)| w).sum();
+    let mut mean = pivot + valid().map(|(w, [m, _])| w * (m - pivot)).sum::<f64>() / total;
+    if !mean.is_finite() {
+        mean = valid().map(|(w, [m, _])| w * m).sum::<f64>() / total;
+    }
+    // a NaN variance beside a mean is what an infinity left
+    let spread = valid().map(|(w, [m, v])| w * (v + (m - mean) * (m - mean))).sum::<f64>() / total;
+    Some([mean, spread])
 }
 
 impl Steps {
@@ -188,11 +239,9 @@ impl Steps {
         let cells = Six {
             mean: places.map(|p| &means[p..p + n]),
             variance: places.map(|p| &variances[p..p + n]),
-            weight: six_weights(i, self.volume[axis] as i64, [true; 6]),
+            weight: full_weights(i, self.volume[axis] as i64),
         };
-        if !pool(level, &cells, out_m, out_v) {
-            mend(&cells, |_| (i, self.volume[axis] as i64), out_m, out_v);
-        }
+        pool_six(level, &cells, out_m, out_v);
     }
 
     /// Pass along x: the row's even and odd cells are set apart, so that taps are whole rows again; a missing cell at an
@@ -228,12 +277,9 @@ impl Steps {
             let cells = Six {
                 mean: taps.map(|t| &split_m[t + from..t + to]),
                 variance: taps.map(|t| &split_v[t + from..t + to]),
-                weight: six_weights(first + from as i64, volume, [true; 6]),
+                weight: full_weights(first + from as i64, volume),
             };
-            let (m, v) = (&mut out_m[from..to], &mut out_v[from..to]);
-            if !pool(level, &cells, m, v) {
-                mend(&cells, |x| (first + (from + x) as i64, volume), m, v);
-            }
+            pool_six(level, &cells, &mut out_m[from..to], &mut out_v[from..to]);
         };
         (0..low).for_each(|x| run(x, x + 1));
         if low < high {
@@ -251,13 +297,12 @@ struct Six<'a> {
 }
 
 multiversion! {
-    /// Pools six rows; returns whether every result is finite. Relative to the third tap (cell 2i, which always exists), so
-    /// that constants stay what they are.
-    fn pool[](cells: &Six, mean: &mut [f64], variance: &mut [f64]) -> bool = pool_inner;
+    /// Pools six rows. Relative to the third tap (cell 2i, which always exists), so that constants stay what they are.
+    fn pool_six[](cells: &Six, mean: &mut [f64], variance: &mut [f64]) -> () = pool_six_inner;
 }
 
 #[inline(always)]
-fn pool_inner(cells: &Six, mean: &mut [f64], variance: &mut [f64]) -> bool {
+fn pool_six_inner(cells: &Six, mean: &mut [f64], variance: &mut [f64]) {
     let n = mean.len();
     let variance = &mut variance[..n];
     let [m0, m1, m2, m3, m4, m5] = cells.mean.map(|m| &m[..n]);
@@ -273,31 +318,6 @@ fn pool_inner(cells: &Six, mean: &mut [f64], variance: &mut [f64]) -> bool {
             + (one(w2, v2[i], p) + one(w3, v3[i], m3[i]))
             + (one(w4, v4[i], m4[i]) + one(w5, v5[i], m5[i]));
     }
-    variance.iter().fold(true, |all, v| all & v.is_finite())
-}
-
-/// Pools again, cell by cell, where a result is not finite: over valid cells only. `place` gives a cell's global index and
-/// the number of fine cells of the axis.
-fn mend(cells: &Six, place: impl Fn(usize) -> (i64, i64), mean: &mut [f64], variance: &mut [f64]) {
-    for x in 0..mean.len() {
-        if mean[x].is_finite() && variance[x].is_finite() {
-            continue;
-        }
-        let (i, n) = place(x);
-        // a NaN mean is a missing cell; a NaN variance beside a mean is what an infinity left
-        let weight = six_weights(i, n, cells.mean.map(|m| !m[x].is_nan()));
-        let taps = || (0..6).filter(|&k| weight[k] > 0.0).map(|k| (weight[k], cells.mean[k][x], cells.variance[k][x]));
-        let Some((_, pivot, _)) = taps().next() else {
-            (mean[x], variance[x]) = (f64::NAN, f64::NAN);
-            continue;
-        };
-        let mut m = pivot + taps().map(|(w, m, _)| w * (m - pivot)).sum::<f64>();
-        if !m.is_finite() {
-            m = taps().map(|(w, m, _)| w * m).sum();
-        }
-        mean[x] = m;
-        variance[x] = taps().map(|(w, t, v)| w * (v + (t - m) * (t - m))).sum();
-    }
 }
 
 #[cfg(test)]
@@ -308,8 +328,8 @@ mod tests {
     use crate::kernel::hostile::{SHAPES, calm, constant, volume};
     use crate::kernel::simd::Level;
 
-    /// One axis of one step as section 4 has it: blur every cell, then pool pairs.
-    fn step_axis(level: &Moments, shape: Shape, axis: usize) -> (Moments, Shape) {
+    /// One step as section 4 has it: every cell blurred over what is valid, then pairs pooled.
+    fn step_whole(level: &Moments, shape: Shape, halve: [bool; 3]) -> (Moments, Shape) {
         let pool = |cells: &[(f64, f64, f64)]| {
             let valid: Vec<_> = cells.iter().filter(|c| !c.1.is_nan()).collect();
             if valid.is_empty() {
@@ -319,26 +339,29 @@ mod tests {
             let mean = valid.iter().map(|c| c.0 * c.1).sum::<f64>() / total;
             (mean, valid.iter().map(|c| c.0 * (c.2 + (c.1 - mean).powi(2))).sum::<f64>() / total)
         };
-        let index = |p: [usize; 3], s: Shape| (p[0] * s[1] + p[1]) * s[2] + p[2];
-        let mut coarse = shape;
-        coarse[axis] = shape[axis].div_ceil(2);
+        let index = |p: [i64; 3]| ((p[0] * shape[1] as i64 + p[1]) * shape[2] as i64 + p[2]) as usize;
+        let whole = Region::whole(shape);
+        let reach = halve.map(|h| 2 * usize::from(h));
+        let blur = |c: [i64; 3]| {
+            let taps: Vec<_> = Region::new(c, c.map(|i| i + 1))
+                .grow(reach)
+                .clip(&whole)
+                .iter()
+                .map(|p| {
+                    let weight = |a: usize| [1.0, 4.0, 6.0, 4.0, 1.0][(p[a] - c[a] + 2) as usize];
+                    ((0..3).map(weight).product(), level.mean[index(p)], level.variance[index(p)])
+                })
+                .collect();
+            let (m, v) = pool(&taps);
+            (1.0, m, v)
+        };
+        let coarse: Shape = std::array::from_fn(|a| if halve[a] { shape[a].div_ceil(2) } else { shape[a] });
+        let factor = halve.map(|h| 1 + i64::from(h));
         let mut out = Moments::default();
         for p in Region::whole(coarse).iter() {
-            let p = p.map(|i| i as usize);
-            let blurred = (0..2).filter(|j| 2 * p[axis] + j < shape[axis]).map(|j| {
-                let taps: Vec<_> = (0..5)
-                    .filter_map(|k| (2 * p[axis] + j + k).checked_sub(2).filter(|q| *q < shape[axis]).map(|q| (k, q)))
-                    .map(|(k, q)| {
-                        let mut from = p;
-                        from[axis] = q;
-                        let i = index(from, shape);
-                        ([1.0, 4.0, 6.0, 4.0, 1.0][k], level.mean[i], level.variance[i])
-                    })
-                    .collect();
-                let (m, v) = pool(&taps);
-                (1.0, m, v)
-            });
-            let (m, v) = pool(&blurred.collect::<Vec<_>>());
+            let covered =
+                Region::new(std::array::from_fn(|a| p[a] * factor[a]), std::array::from_fn(|a| (p[a] + 1) * factor[a]));
+            let (m, v) = pool(&covered.clip(&whole).iter().map(blur).collect::<Vec<_>>());
             out.mean.push(m);
             out.variance.push(v);
         }
@@ -378,10 +401,7 @@ mod tests {
                     fine.mean.iter_mut().for_each(|m| *m = if m.abs() > 1e20 { 7.0 } else { *m });
                     let mut size = shape;
                     for _ in 0..3 {
-                        let (mut expect, mut coarse) = (fine.clone(), size);
-                        for axis in (0..3).filter(|a| halve[*a]) {
-                            (expect, coarse) = step_axis(&expect, coarse, axis);
-                        }
+                        let (expect, coarse) = step_whole(&fine, size, halve);
                         let whole = Region::whole(coarse);
                         let got = step(&fine, Region::whole(size), size, halve, whole, Level::Baseline);
                         for (i, (e, g)) in expect.mean.iter().zip(&got.mean).enumerate() {
@@ -407,6 +427,27 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    /// With missing cells, too, no axis comes before another.
+    #[test]
+    fn axes_may_be_exchanged() {
+        let shape = [6, 6, 6];
+        let at = |[z, y, x]: [usize; 3]| (z * 6 + y) * 6 + x;
+        let v: Vec<f64> = (0..216).map(|i| if i % 5 < 3 { f64::NAN } else { (i * i % 17) as f64 }).collect();
+        let cells = |turn: fn([usize; 3]) -> [usize; 3]| {
+            let mean: Vec<f64> = (0..216).map(|i| v[at(turn([i / 36, i / 6 % 6, i % 6]))]).collect();
+            let variance = mean.iter().map(|m| m * 0.0).collect();
+            let fine = Moments { mean, variance };
+            step(&fine, Region::whole(shape), shape, [true; 3], Region::whole([3; 3]), Level::detect())
+        };
+        let (plain, turned) = (cells(|p| p), cells(|[z, y, x]| [x, z, y]));
+        for i in 0..27 {
+            let [z, y, x] = [i / 9, i / 3 % 3, i % 3];
+            let other = (x * 3 + z) * 3 + y;
+            assert!((turned.mean[i] - plain.mean[other]).abs() < 1e-12, "cell {i}");
+            assert!((turned.variance[i] - plain.variance[other]).abs() < 1e-10, "cell {i}");
         }
     }
 
