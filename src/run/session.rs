@@ -21,10 +21,10 @@ use super::report::{self, Report};
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
-use super::{second, windows};
+use super::{planned, second, windows};
 use crate::brick::{Pool, Scratch};
-use crate::config::{Config, Device, config_hash};
-use crate::gpu::{self, Gpu};
+use crate::config::{Config, config_hash};
+use crate::gpu::Gpu;
 use crate::grid::{Region, order::morton};
 use crate::plan::{BrickChoice, Group, Plan};
 use crate::store::sink::{Claim, Sink};
@@ -82,13 +82,13 @@ impl<'a> Session<'a> {
             return Err(Error::Failed(format!("{} sources for {} inputs", sources.len(), config.inputs.len())));
         }
         let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
-        let (plan, gpu) = plan_and_gpu(config, &infos, options.resume)?;
+        let (plan, gpu) = planned::plan_and_gpu(config, &infos, options.resume)?;
         plan.warnings.iter().for_each(|w| progress.note(w));
         plan.gpu_note(config).iter().for_each(|n| progress.note(n));
         let identities = sources.iter().map(Source::identity).collect::<Result<Vec<_>>>()?;
         let hash = config_hash(config);
         let mut header = journal::header(&hash, &identities, plan.task_count(), &json!(plan.held), &[]);
-        header["reasons"] = reasons(&plan);
+        header["reasons"] = planned::reasons(&plan);
         let mut claims = outputs::claim_begun(config, &plan)?;
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
         if start != Start::Complete {
@@ -478,27 +478,6 @@ impl<'a> Session<'a> {
     pub fn elapsed(&self) -> Duration {
         Duration::from_secs_f64(self.metrics.seconds())
     }
-}
-
-/// Where everything runs and why, for who reads the journal.
-fn reasons(plan: &Plan) -> Value {
-    plan.placement.iter().map(|(name, device, why)| json!({ "stage": name, "device": device, "why": why })).collect()
-}
-
-/// Plans, and opens the GPU where a step runs on it. With `auto`, a run that was begun without a GPU goes on without one.
-fn plan_and_gpu(config: &Config, infos: &[VolumeInfo], resume: bool) -> Result<(Plan, Option<Gpu>)> {
-    let mut opened = None;
-    let plan = Plan::new(config, infos, &mut || gpu::find(config.run.device, &mut opened))?;
-    let Some(facts) = &plan.gpu else { return Ok((plan, None)) };
-    let earlier = if resume { Journal::read(&outputs::journal_dir(&plan)) } else { None };
-    if config.run.device == Device::Auto && earlier.is_some_and(|e| e.header["placement"] != json!(plan.held)) {
-        let without = Plan::new(config, infos, &mut || Err("the run was begun without one".into()))?;
-        return Ok((without, None));
-    }
-    if let Some(gpu) = &mut opened {
-        gpu.set_cap(facts.buffer_cap(plan.memory));
-    }
-    Ok((plan, opened))
 }
 
 impl Drop for Session<'_> {
