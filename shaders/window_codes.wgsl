@@ -215,6 +215,14 @@ fn variance(w: Window) -> vec2<u32> {
     return product_of(product_of(w.numerator, inverse), inverse);
 }
 
+// Of values that are not scaled, from the exact sum of their squares: below 2^63, so what wraps on the way comes back.
+fn mean_square(w: Window) -> vec2<u32> {
+    let shift = times64(times32(w.n, p.flip), vec2<u32>(p.flip, 0u)).xy;
+    let twice = left64(times64(w.s1, vec2<u32>(p.flip, 0u)).xy, 1u);
+    let squares = minus64(plus64(w.s2, shift), twice);
+    return quotient_of(of_integer(squares), of_integer(vec2<u32>(w.n, 0u)));
+}
+
 fn spread(v: vec2<u32>) -> vec2<u32> {
     if p.scaled == 0u {
         return v;
@@ -297,6 +305,9 @@ fn result(w: Window, channel: u32) -> u32 {
         case 5u: {
             if (parts & 1u) == 0u {
                 return 0u;
+            }
+            if p.scaled == 0u {
+                return narrowed(mean_square(w));
             }
             return narrowed(sum_of(spread(w.variance), product_of(w.mean, w.mean)));
         }

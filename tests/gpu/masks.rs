@@ -144,7 +144,7 @@ fn later_steps_read_fills() {
     }
 }
 
-/// Stages of one mask, of another, of none; one that hangs on a stage; every way of reducing.
+/// Stages of one mask, of another, of none; one that hangs on a stage; every way of reducing but by moments.
 const CONFIG: &str = r#"
 [run]
 threads = 2
@@ -180,7 +180,6 @@ where = { input = "all.mean", min = 30000 }
 [output.var]
 path = "out/var.zarr"
 from = "stats.variance"
-reduce = "moments"
 chunk = 4
 shard = 8
 [output.least]

@@ -57,7 +57,7 @@ fn moments_inner<T: Code, X1: RowSum, X2: Acc, O: Voxel>(
                     let squares = squares(s1[i].low(), s2[i].low(), n[i], offset as u64);
                     out[i] = O::from_f64(match few {
                         true => exact_mean(squares, n[i], inverse[i], 0.0),
-                        false => long_mean(squares, n[i], 0.0),
+                        false => squares as f64 / n[i] as f64,
                     });
                 }
             }
