@@ -5,11 +5,14 @@
 //! of means, which is what pooling twice gives too. Axes follow each other (z, y, x). Where a window holds a NaN cell, axes do
 //! not part: such cells are made anew from their windows, the 125 taps of each blurred cell renormalised to what is valid.
 
+mod gaps;
+
 use super::Context;
 use super::values::{blocks, load_any};
 use crate::brick::scratch::{cut, padded};
 use crate::grid::{Affine, AnyView, Region, Shape};
 use crate::multiversion;
+use gaps::Fine;
 
 /// Unrounded pooled moments of one level, dense over a box: `variance` is the population variance of the pooled values.
 /// A cell without valid voxels has NaN in both.
@@ -100,12 +103,7 @@ pub fn coarsen(
     if dst.variance.iter().all(|v| v.is_finite()) {
         return;
     }
-    let fine = Fine { cells: fine, region: fine_box, volume: fine_volume };
-    for (i, cell) in coarse_box.iter().enumerate() {
-        if !(dst.mean[i].is_finite() && dst.variance[i].is_finite()) {
-            [dst.mean[i], dst.variance[i]] = fine.pool_valid(halve, cell);
-        }
-    }
+    Fine { cells: fine, region: fine_box, volume: fine_volume, halve }.mend(cx.level, coarse_box, dst);
 }
 
 /// Where the needed box lies in the buffer of the finer level.
@@ -143,63 +141,6 @@ pub fn full_weights(i: i64, n: i64) -> [f64; 6] {
         found += 1.0;
     }
     std::array::from_fn(|k| (blurred[0][k] + blurred[1][k]) / found)
-}
-
-/// Cells of a level and where they lie in it.
-struct Fine<'a> {
-    cells: &'a Moments,
-    region: Region,
-    volume: Shape,
-}
-
-impl Fine<'_> {
-    /// Mean and variance of a cell; NaN means where it is missing.
-    fn at(&self, cell: [i64; 3]) -> [f64; 2] {
-        let (shape, at) = (self.region.shape(), std::array::from_fn(|a| (cell[a] - self.region.lo[a]) as usize));
-        let [z, y, x]: [usize; 3] = at;
-        let i = (z * shape[1] + y) * shape[2] + x;
-        [self.cells.mean[i], self.cells.variance[i]]
-    }
-
-    /// The cell `coarse` of the next level over the valid cells of its windows: each blurred cell that it covers by its taps, then
-    /// those that have any, alike. NaN where there is none.
-    fn pool_valid(&self, halve: [bool; 3], coarse: [i64; 3]) -> [f64; 2] {
-        // First blurred cell, and how many there are; of an axis that stays, the cell itself, unblurred.
-        let first: [i64; 3] = std::array::from_fn(|a| if halve[a] { 2 * coarse[a] } else { coarse[a] });
-        let end: [i64; 3] = std::array::from_fn(|a| (first[a] + 1 + i64::from(halve[a])).min(self.volume[a] as i64));
-        let reach = halve.map(|h| if h { 2 } else { 0 });
-        let window = Region::new(first, end).grow(reach).clip(&Region::whole(self.volume));
-        if window.iter().all(|cell| self.at(cell)[0].is_nan()) {
-            return [f64::NAN; 2];
-        }
-        let blurred = Region::new(first, end).iter().filter_map(|b| {
-            let taps = Region::new(b, b.map(|i| i + 1)).grow(reach).clip(&Region::whole(self.volume));
-            pool(|| {
-                taps.iter().map(|cell| {
-                    let weight = |a: usize| if halve[a] { TAPS[(cell[a] - b[a] + 2) as usize] } else { 1.0 };
-                    ((0..3).map(weight).product(), self.at(cell))
-                })
-            })
-        });
-        let mut found = [[0.0; 2]; 8];
-        let count = blurred.zip(&mut found).map(|(b, to)| *to = b).count();
-        pool(|| found[..count].iter().map(|b| (1.0, *b))).unwrap_or([f64::NAN; 2])
-    }
-}
-
-/// Mean and variance of weighted cells that are valid; `None` where none is. Relative to the first of them, so that constants stay
-/// what they are, except where an infinity stands.
-fn pool<I: Iterator<Item = (f64, [f64; 2])>>(cells: impl Fn() -> I) -> Option<[f64; 2]> {
-    let valid = || cells().filter(|(_, [m, _])| !m.is_nan());
-    let (_, [pivot, _]) = valid().next()?;
-    let total: f64 = valid().map(|(w, _)| w).sum();
-    let mut mean = pivot + valid().map(|(w, [m, _])| w * (m - pivot)).sum::<f64>() / total;
-    if !mean.is_finite() {
-        mean = valid().map(|(w, [m, _])| w * m).sum::<f64>() / total;
-    }
-    // a NaN variance beside a mean is what an infinity left
-    let spread = valid().map(|(w, [m, v])| w * (v + (m - mean) * (m - mean))).sum::<f64>() / total;
-    Some([mean, spread])
 }
 
 impl Steps {
