@@ -1,4 +1,5 @@
-//! Tiled and compressed TIFF pages, written by hand here, read back voxel for voxel.
+//! Tiled and compressed TIFF pages, written by hand here, read back voxel for voxel; forms that are not read are refused by
+//! name, with what would be accepted.
 
 mod common_sources;
 
@@ -8,6 +9,7 @@ use std::path::Path;
 
 use common_sources::*;
 use occlude::grid::DType;
+use occlude::store::Source;
 
 /// One page to write: little-endian, one sample per pixel.
 struct Page {
@@ -205,4 +207,24 @@ fn tiles_that_stick_out_of_the_page_are_read() {
             }
         }
     }
+}
+
+#[test]
+fn palettes_and_volumetric_tiles_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("odd.tif");
+    for compression in [1, 5] {
+        write(&Page { photometric: 3, compression, ..PAGE }, &path);
+        let e = Source::open(&file_input(&path)).unwrap_err();
+        assert_eq!(e.exit_code(), 1);
+        let e = e.to_string();
+        assert!(e.contains("odd.tif") && e.contains("palette") && e.contains("accepted are grey values"), "{e}");
+        write(&Page { depth: 16, compression, ..PAGE }, &path);
+        let e = Source::open(&file_input(&path)).unwrap_err();
+        assert_eq!(e.exit_code(), 1);
+        let e = e.to_string();
+        assert!(e.contains("ImageDepth 16") && e.contains("accepted are planes"), "{e}");
+    }
+    write(&PAGE, &path);
+    Source::open(&file_input(&path)).unwrap();
 }
