@@ -1,8 +1,9 @@
-//! What stands in outputs where no value is.
+//! What stands in outputs where no value is: missing voxels in integer outputs, and fills that a channel cannot hold.
 
 mod common;
 
 use common::*;
+use occlude::run::Silent;
 
 /// The voxels of a `.npy` of u8 or u16.
 fn npy(path: &std::path::Path, size: usize, n: usize) -> Vec<u16> {
@@ -46,4 +47,32 @@ fn missing_voxels_of_a_plain_pyramid_hold_the_fill_of_its_type() {
     // A copy in the input's own type stays one.
     run(dir.path(), &text("", "native", ""), &[]);
     assert_eq!(npy(&dir.path().join("plain.npy"), 1, 8), [255, 5, 7, 255, 255, 255, 9, 3]);
+}
+
+#[test]
+fn a_fill_that_the_channel_cannot_hold_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    write_npy(&dir.path().join("v.npy"), "|u1", [1, 2, 4], &[1, 2, 3, 4, 5, 6, 7, 8]);
+    let text = |channel: &str, fill: &str| {
+        format!(
+            "[input.v]\npath = 'v.npy'\n[stage.m]\nop = 'box'\ninput = 'v'\nradius = 1\nfill = {fill}\n\
+             where = {{ input = 'v', min = 5 }}\n[output.o]\npath = 'o.npy'\nfrom = 'm.{channel}'\n"
+        )
+    };
+    for fill in ["-5", "300", "2.5"] {
+        let config = parse(dir.path(), &text("min", fill), &[]);
+        for error in [
+            occlude::run::run(&config, &Default::default(), &Silent).unwrap_err(),
+            occlude::plan::explain(&config).unwrap_err(),
+        ] {
+            assert_eq!(error.exit_code(), 2);
+            let error = error.to_string();
+            let says = format!("config.toml:7: stage.m.fill: got {fill}, which m.min (u8) cannot hold");
+            assert!(error.contains(&says) && error.contains("a whole number from 0 to 255"), "{error}");
+        }
+        // What nobody reads need not hold it, and floats do.
+        run(dir.path(), &text("mean", fill), &[]);
+    }
+    run(dir.path(), &text("min", "255"), &[]);
+    assert_eq!(npy(&dir.path().join("o.npy"), 1, 8)[0], 255);
 }

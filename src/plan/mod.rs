@@ -3,6 +3,7 @@
 
 pub mod brick;
 pub mod explain;
+mod fills;
 mod fits;
 pub mod flows;
 pub mod graph;
@@ -85,6 +86,7 @@ impl Plan {
     /// `find_gpu` is called at most once, when a GPU could be used.
     pub fn new(config: &Config, infos: &[VolumeInfo], find_gpu: FindGpu) -> Result<Plan> {
         let mut lowered = lower::lower(config, infos)?;
+        fills::check(config, &lowered.graph)?;
         let outputs = outputs::plan_outputs(config, infos, &mut lowered)?;
         let threads = match config.run.threads {
             0 => std::thread::available_parallelism().map_or(1, |n| n.get()),
