@@ -71,3 +71,40 @@ fn an_origin_in_the_config_reaches_every_output() {
         }
     }
 }
+
+/// An OME-Zarr 0.4 image of 4 x 5 x 6 voxels whose axes have these names.
+fn ome(folder: &std::path::Path, names: [&str; 3]) {
+    let axes = names.map(|n| serde_json::json!({ "name": n, "type": "space", "unit": "micrometer" }));
+    let scale = serde_json::json!([{ "type": "scale", "scale": [2, 1, 1] }]);
+    let image = serde_json::json!({
+        "version": "0.4", "axes": axes, "datasets": [{ "path": "0", "coordinateTransformations": scale }]
+    });
+    fs::create_dir_all(folder.join("0")).unwrap();
+    fs::write(folder.join(".zgroup"), r#"{"zarr_format": 2}"#).unwrap();
+    fs::write(folder.join(".zattrs"), serde_json::json!({ "multiscales": [image] }).to_string()).unwrap();
+    let array = serde_json::json!({
+        "zarr_format": 2, "shape": [4, 5, 6], "chunks": [4, 5, 6], "dtype": "|u1", "order": "C", "fill_value": 0,
+        "compressor": null, "filters": null, "dimension_separator": "/"
+    });
+    fs::write(folder.join("0/.zarray"), array.to_string()).unwrap();
+    fs::create_dir_all(folder.join("0/0/0")).unwrap();
+    fs::write(folder.join("0/0/0/0"), (0..120).collect::<Vec<u8>>()).unwrap();
+}
+
+#[test]
+fn axes_in_another_order_are_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("m.zarr");
+    let text = "[input.v]\npath = 'm.zarr'\n[output.o]\npath = 'o.npy'\nfrom = 'v'\n";
+    for (names, odd) in [(["x", "y", "z"], true), (["z", "x", "y"], true), (["z", "y", "x"], false)] {
+        ome(&path, names);
+        let warnings = Source::open(&file_input(&path)).unwrap().info().warnings.clone();
+        let (_, plan) = occlude::plan::explain(&common::parse(folder.path(), text, &[])).unwrap();
+        let info = std::process::Command::new(common::program()).arg("info").arg(&path).output().unwrap();
+        let info = String::from_utf8(info.stdout).unwrap();
+        let said = format!("axes are named {}, slowest first", names.join(", "));
+        assert_eq!(warnings.iter().any(|w| w.contains(&said)), odd, "{warnings:?}");
+        assert_eq!(plan["warnings"].to_string().contains(&format!("input v: its {said}")), odd, "{plan}");
+        assert_eq!(info.contains(&said), odd, "{info}");
+    }
+}
