@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use common::*;
 use occlude::run::{Cancel, Progress, RunOptions, Session, Silent};
+use occlude::store::Sink;
 
 const SHAPE: [usize; 3] = [24, 40, 2300];
 
@@ -366,5 +367,31 @@ fn one_run_at_a_time_writes_an_output() {
     run(dir.path(), CONFIG, &[]);
     for (name, (a, b)) in OUTPUTS.iter().zip(alone.iter().zip(&decoded(dir.path()))) {
         assert_same(name, a, b);
+    }
+}
+
+/// What was finished and then deleted by hand is nothing: a run starts afresh. What is unfinished lies elsewhere and stays.
+#[test]
+fn a_finished_file_that_was_deleted_is_made_again() {
+    let dir = tempfile::tempdir().unwrap();
+    write_npy(&dir.path().join("v.npy"), "|u1", [2, 3, 4], &(0..24).collect::<Vec<u8>>());
+    for ending in ["npy", "raw", "nrrd", "nii"] {
+        let path = dir.path().join(format!("o.{ending}"));
+        let text = format!("[input.v]\npath = 'v.npy'\n[output.o]\npath = 'o.{ending}'\nfrom = 'v'\n");
+        let config = parse(dir.path(), &text, &[]);
+        let first = run_with(&config, &RunOptions::default());
+        let made = std::fs::read(&path).unwrap();
+        for resume in [false, true] {
+            std::fs::remove_file(&path).unwrap();
+            let again = run_with(&config, &RunOptions { resume, ..Default::default() });
+            assert_eq!(std::fs::read(&path).unwrap(), made, "{ending}, resume {resume}");
+            assert_eq!(again.bricks.computed, first.bricks.computed, "{ending}, resume {resume}");
+        }
+        // Killed between the last word and the name: whole, but not there yet.
+        let part = Sink::work_dir(&path).join("data.part");
+        std::fs::rename(&path, &part).unwrap();
+        let refused = occlude::run::run(&config, &RunOptions::default(), &Silent).unwrap_err();
+        assert!(refused.to_string().contains("exists; --resume continues it"), "{refused}");
+        assert!(part.exists());
     }
 }

@@ -44,7 +44,7 @@ fn levels(args: &InfoArgs, first: &VolumeInfo, attributes: &Attributes) -> Vec<V
 }
 
 fn warnings(info: &VolumeInfo, attributes: &Attributes) -> Vec<String> {
-    let mut found = Vec::new();
+    let mut found = info.warnings.clone();
     if attributes.complete() == Some(false) {
         found.push("this output was not finished".to_string());
     }

@@ -62,7 +62,7 @@ pub fn parse(text: &str, file: &Path, sets: &[String]) -> Result<Config> {
 }
 
 fn build(text: &str, file: &Path, sets: &[String]) -> Result<Config> {
-    let mut root = tree::parse(text).map_err(|f| error("", f.line, f.message))?;
+    let mut root = tree::parse(text).map_err(|f| error(&f.key, f.line, f.message))?;
     let mut document = text.parse::<toml_edit::DocumentMut>().ok();
     for set in sets {
         let edit = Edit::parse(set).map_err(|m| error("", None, m))?;

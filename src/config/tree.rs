@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use toml::de::{DeTable, DeValue};
+use toml::de::{DeString, DeTable, DeValue};
 
 /// Key and value, in the order of the file.
 pub type Table = Vec<(String, Node)>;
@@ -34,10 +34,12 @@ pub fn find<'a>(table: &'a Table, key: &str) -> Option<&'a Node> {
     table.iter().find(|(k, _)| k == key).map(|(_, node)| node)
 }
 
-/// What is wrong with a text, and in which line.
+/// What is wrong with a text, at which key and in which line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fault {
     pub line: Option<usize>,
+    /// Dotted; empty where the text is no TOML.
+    pub key: String,
     pub message: String,
 }
 
@@ -69,18 +71,28 @@ pub fn parse_value(text: &str) -> Result<Node, Fault> {
 
 fn fault(e: &toml::de::Error, lines: Option<&Lines>) -> Fault {
     let line = lines.and_then(|l| e.span().map(|span| l.at(span.start)));
-    Fault { line, message: format!("not valid TOML: {}", e.message().trim().replace('\n', "; ")) }
+    Fault { line, key: String::new(), message: format!("not valid TOML: {}", e.message().trim().replace('\n', "; ")) }
 }
 
 fn convert_table(table: &DeTable, lines: Option<&Lines>) -> Result<Table, Fault> {
-    let node = |value: &DeValue, at: usize| {
-        Ok(Node { value: convert(value, lines)?, line: lines.map(|l| l.at(at)), set: false })
+    let entry = |(k, v): (&toml::Spanned<DeString>, &toml::Spanned<DeValue>)| {
+        let (key, line) = (k.get_ref().to_string(), lines.map(|l| l.at(k.span().start)));
+        let inside = |f: Fault| Fault {
+            key: if f.key.is_empty() { key.clone() } else { format!("{key}.{}", f.key) },
+            line: f.line.or(line),
+            ..f
+        };
+        let value = convert(v.get_ref(), lines).map_err(inside)?;
+        Ok((key, Node { value, line, set: false }))
     };
-    table.iter().map(|(k, v)| Ok((k.get_ref().to_string(), node(v.get_ref(), k.span().start)?))).collect()
+    table.iter().map(entry).collect()
 }
 
 fn convert(value: &DeValue, lines: Option<&Lines>) -> Result<Value, Fault> {
-    let out_of_range = |what: String| Fault { line: None, message: format!("{what} does not fit in 64 bits") };
+    let out_of_range = |what: String| {
+        let message = format!("got {what}, which does not fit in 64 bits; expected {} to {}", i64::MIN, i64::MAX);
+        Fault { line: None, key: String::new(), message }
+    };
     Ok(match value {
         DeValue::String(s) => Value::Text(s.to_string()),
         DeValue::Integer(i) => {
@@ -256,10 +268,24 @@ mod tests {
     fn broken_text_names_the_line() {
         assert_eq!(parse("a = 1\nb = [1,\nc = 2\n").unwrap_err().line.map(|l| l >= 2), Some(true));
         assert_eq!(parse("a = 1\na = 2\n").unwrap_err().line, Some(2));
-        assert_eq!(
-            parse("a = 99999999999999999999").unwrap_err().message,
-            "99999999999999999999 does not fit in 64 bits"
-        );
+    }
+
+    #[test]
+    fn numbers_of_more_than_64_bits_name_their_key_and_line() {
+        for (text, key, line) in [
+            ("a = 99999999999999999999", "a", 1),
+            ("[run]\nthreads = 99999999999999999999\n", "run.threads", 2),
+            ("[stage.ao]\nop = \"box\"\nradius = [1,\n 99999999999999999999, 2]\n", "stage.ao.radius", 4),
+            ("[stage.ao]\nwhere = { input = \"ct\", min = -99999999999999999999 }\n", "stage.ao.where.min", 2),
+        ] {
+            let fault = parse(text).unwrap_err();
+            assert_eq!((fault.key.as_str(), fault.line), (key, Some(line)), "{text}");
+            let message = &fault.message;
+            assert!(
+                message.contains("99999999999999999999") && message.contains("to 9223372036854775807"),
+                "{message}"
+            );
+        }
     }
 
     #[test]

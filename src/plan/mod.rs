@@ -3,6 +3,7 @@
 
 pub mod brick;
 pub mod explain;
+mod fills;
 mod fits;
 pub mod flows;
 pub mod graph;
@@ -85,6 +86,7 @@ impl Plan {
     /// `find_gpu` is called at most once, when a GPU could be used.
     pub fn new(config: &Config, infos: &[VolumeInfo], find_gpu: FindGpu) -> Result<Plan> {
         let mut lowered = lower::lower(config, infos)?;
+        fills::check(config, &lowered.graph)?;
         let outputs = outputs::plan_outputs(config, infos, &mut lowered)?;
         let threads = match config.run.threads {
             0 => std::thread::available_parallelism().map_or(1, |n| n.get()),
@@ -94,7 +96,10 @@ impl Plan {
         let (mut placement, gpu) = placement(config, &graph, &outputs, find_gpu)?;
         let held = placement.iter().map(|(name, device, _)| (name.clone(), *device)).collect();
         let flows = join_flows(&graph, &mut placement);
-        let warnings = warnings(&graph);
+        let inputs = config.inputs.iter().zip(infos);
+        let mut warnings: Vec<String> =
+            inputs.flat_map(|(i, info)| info.warnings.iter().map(|w| format!("input {}: {w}", i.name))).collect();
+        warnings.extend(long_windows(&graph));
         let mut plan = Plan {
             groups: Vec::new(),
             prepasses: lowered.prepasses,
@@ -365,7 +370,7 @@ fn no_such_gpu(config: &Config, why: &str) -> Error {
 }
 
 /// Windows of equal voxel radius on unequal spacing are long in space: say so.
-fn warnings(graph: &Graph) -> Vec<String> {
+fn long_windows(graph: &Graph) -> Vec<String> {
     let mut warnings = Vec::new();
     for step in &graph.steps {
         let graph::StepKind::Window { params, .. } = &step.kind else { continue };

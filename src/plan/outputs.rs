@@ -1,6 +1,6 @@
 //! What each output holds: wires, element type, mapping, pyramid, and which levels are made where.
 
-use super::graph::{Wire, WireId};
+use super::graph::{Producer, Wire, WireId};
 use super::lower::{Lowered, UNROUNDED_MEAN};
 use super::{Prepass, PrepassKind};
 use crate::config::{Config, Op, Output, OutputDType, OutputFormat, OutputRange, op_channels};
@@ -116,7 +116,8 @@ fn plan_output(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered, ind
     let names = component_names(output, &used, &parts);
     let multi = parts.len() > 1 || output.from.len() > 1;
     let means = parts.iter().map(|&(w, _)| mean_beside(lowered, w)).collect();
-    let fills = used.iter().map(|w| w.fill).collect();
+    let coded = range.is_some() || auto;
+    let fills = used.iter().map(|w| fill_of(w, coded)).collect();
     let spec = SinkSpec {
         name: output.name.clone(),
         path: output.path.clone(),
@@ -344,8 +345,14 @@ fn fill_value(
     debug_assert!(!map_op);
     match range {
         None if dtype != native => 0.0, // not known yet: see `OutputPlan::missing`
-        _ => code(dtype, wire.fill, range),
+        _ => code(dtype, fill_of(wire, range.is_some()), range),
     }
+}
+
+/// What stands for missing voxels of a channel in integer outputs. Copies of an input keep its nodata value; where a range
+/// turns values into codes, that value means nothing any more.
+fn fill_of(wire: &Wire, coded: bool) -> f64 {
+    if coded && matches!(wire.producer, Producer::Input(_)) { 0.0 } else { wire.fill }
 }
 
 /// A value as an integer type stores it.

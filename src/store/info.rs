@@ -28,6 +28,8 @@ pub struct VolumeInfo {
     pub chunk: Option<Shape>,
     /// How the file stores it, for people: `NIfTI-1, gzip`, `Zarr v3, blosc`, ...
     pub format: String,
+    /// What may surprise whoever reads it as z, y, x.
+    pub warnings: Vec<String>,
 }
 
 /// Direction matrix and space of a file.
@@ -56,6 +58,7 @@ impl VolumeInfo {
             times: 1,
             chunk: None,
             format: format.into(),
+            warnings: Vec::new(),
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
@@ -12,8 +12,11 @@ use crate::{Error, Result};
 /// Marker in the work folder.
 pub const META: &str = "meta.json";
 
+/// A flat file that is not whole yet.
+const PART: &str = "data.part";
+
 /// Files and folders that sinks make in the work folder.
-const WORK_FILES: [&str; 2] = ["data.part", META];
+const WORK_FILES: [&str; 2] = [PART, META];
 
 /// What stands at a path.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,6 +33,11 @@ pub enum Existing {
 
 fn read_json(path: &Path) -> Option<Value> {
     serde_json::from_slice(&fs::read(path).ok()?).ok()
+}
+
+/// Where a flat file lies until it is whole.
+pub fn part_of(path: &Path) -> PathBuf {
+    Sink::work_dir(path).join(PART)
 }
 
 /// The marker of an output's work folder.
@@ -57,6 +65,8 @@ pub fn existing(path: &Path) -> Existing {
     let unfinished = Existing::Ours { complete: false, occlude: None };
     match fs::metadata(path) {
         Err(_) if fs::symlink_metadata(path).is_ok() => Existing::Foreign,
+        // Finished once and since deleted by hand: nothing is left to continue.
+        Err(_) if meta.as_ref().is_some_and(|m| m["complete"] == true) && !part_of(path).exists() => Existing::None,
         Err(_) if meta.is_some() => unfinished,
         Err(_) => Existing::None,
         Ok(m) if m.is_dir() => match group_attributes(path).map(|mut a| a["occlude"].take()) {

@@ -47,7 +47,7 @@ pub fn fingerprint(path: &Path) -> std::io::Result<Value> {
 impl Flat {
     /// Makes the file at its full length (holes where nothing is written yet) with its header.
     pub fn create(spec: &SinkSpec, temps: Temps, work_dir: PathBuf, resume: bool) -> Result<Flat> {
-        let part = work_dir.join("data.part");
+        let part = existing::part_of(&spec.path);
         let head = header(spec, None);
         let voxels: usize = spec.array_shape(0).iter().product();
         let len = (head.len() + voxels * spec.dtype.size()) as u64;

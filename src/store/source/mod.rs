@@ -318,6 +318,10 @@ fn overridden(mut info: VolumeInfo, input: &Input) -> Result<VolumeInfo> {
             ));
         }
         info.origin = origin;
+        // Outputs that keep the orientation take their origin from its matrix.
+        if let Some(orientation) = &mut info.orientation {
+            (0..3).for_each(|r| orientation.matrix[r][3] = origin[2 - r]);
+        }
     }
     if !info.origin.iter().all(|v| v.is_finite()) {
         info.origin = [0.0; 3];

@@ -96,6 +96,7 @@ fn take_line(path: &Path, header: &mut Header, line: &str, in_list: &mut bool, n
         "lineskip" => "line skip",
         "byteskip" => "byte skip",
         "centers" => "centerings",
+        "axismins" => "axis mins",
         other => other,
     };
     *in_list = name == "data file" && value.split_whitespace().next() == Some("LIST");
@@ -214,6 +215,16 @@ fn axes(path: &Path, h: &Header, sizes: &[u64], directions: &[Option<Vec<f64>>])
     Ok(out)
 }
 
+/// Where each axis begins, and how many cells behind that its first voxel lies: half a one where the header says that
+/// samples are centred in cells. `None` where the header does not say.
+fn axis_mins(path: &Path, h: &Header, count: usize) -> Result<Vec<Option<[f64; 2]>>> {
+    let Some(mins) = numbers::<f64>(path, h, "axis mins", count)? else { return Ok(Vec::new()) };
+    let centres = h.get("centerings").map(words).unwrap_or_default();
+    let in_cells = |a: usize| centres.get(a).is_some_and(|c| c.eq_ignore_ascii_case("cell"));
+    let one = |(a, min): (usize, &f64)| min.is_finite().then(|| [*min, if in_cells(a) { 0.5 } else { 0.0 }]);
+    Ok(mins.iter().enumerate().map(one).collect())
+}
+
 /// Spacing, unit and orientation into `info`.
 fn geometry(
     path: &Path,
@@ -250,7 +261,14 @@ fn geometry(
         (0..3).for_each(|r| matrix[r][3] = origin.get(r).copied().filter(|v| v.is_finite()).unwrap_or(0.0));
         info.orientation = Some(Orientation { matrix, space: if name.is_empty() { "unknown".into() } else { name } });
     } else {
-        (0..3).for_each(|r| info.origin[2 - r] = origin.get(r).copied().filter(|v| v.is_finite()).unwrap_or(0.0));
+        let mins = axis_mins(path, h, axes.len())?;
+        for r in 0..3 {
+            let min = || {
+                space.get(r).and_then(|a| mins.get(*a).copied()?).map(|[min, cells]| min + cells * info.spacing[2 - r])
+            };
+            let known = |v: &f64| v.is_finite();
+            info.origin[2 - r] = origin.get(r).copied().filter(known).or_else(min).unwrap_or(0.0);
+        }
     }
     let named: Vec<Option<String>> = match (h.get("space units"), h.get("units")) {
         (Some(text), _) => words(text).iter().map(|w| units::normalise(w)).collect(),

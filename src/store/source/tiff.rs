@@ -25,6 +25,10 @@ const LEAST_PAGE: u64 = 40;
 /// Longest strip or tile that is decoded, in bytes.
 pub const MOST_CHUNK: usize = 1 << 30;
 
+/// Planes of an image and of its tiles, in a page that holds a volume (SGI's extension).
+const IMAGE_DEPTH: Tag = Tag::Unknown(32997);
+const TILE_DEPTH: Tag = Tag::Unknown(32998);
+
 pub type Reader = Decoder<BufReader<File>>;
 
 /// Opens a TIFF file at its first page, believing in tables of tags and in strips or tiles of up to `most` bytes.
@@ -154,12 +158,24 @@ fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize) -> Result<Op
         };
         return Err(refuse(path, &name));
     }
-    if !matches!(photometric, 0 | 1 | 3) {
+    if photometric == 3 {
+        let text =
+            "palette colours (photometric interpretation 3) are not read; accepted are grey values: save it as grey";
+        return Err(broken(path, image, text));
+    }
+    if !matches!(photometric, 0 | 1) {
         return Err(broken(
             path,
             image,
             format!("photometric interpretation {photometric}; only grey values are read"),
         ));
+    }
+    let depth = number(IMAGE_DEPTH, 1)?.max(number(TILE_DEPTH, 1)?);
+    if depth > 1 {
+        let text = format!(
+            "volumetric tiles (ImageDepth {depth}) are not read; accepted are planes: one page, or one file, per plane"
+        );
+        return Err(broken(path, image, text));
     }
     let first = |list: Option<Vec<u64>>, or: u64| list.and_then(|l| l.first().copied()).unwrap_or(or);
     let bits = first(decoder.find_tag_unsigned_vec(Tag::BitsPerSample).map_err(fail)?, 1);
@@ -183,8 +199,6 @@ fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize) -> Result<Op
         let whole = (height as u64).div_ceil(rows.clamp(1, height.max(1) as u64)) == offsets.len() as u64;
         let follows = |w: &[u64]| w[0].checked_add(strip) == Some(w[1]);
         plain = offsets.first().copied().filter(|_| whole && offsets.windows(2).all(follows));
-    } else if photometric == 3 {
-        return Err(refuse(path, "palette, compressed"));
     }
     Ok(Some(Page { file, image: image as u32, form, plain }))
 }

@@ -152,6 +152,24 @@ fn lead_axes(path: &Path, meta: &ArrayMeta, multiscale: Option<&Multiscale>) -> 
     Ok(out)
 }
 
+/// Says so where the space axes, slowest first, are named otherwise than the end of z, y, x.
+fn other_order(meta: &ArrayMeta, multiscale: Option<&Multiscale>, lead: usize) -> Option<String> {
+    let name = |a: usize| match multiscale.and_then(|m| m.axes.get(a)) {
+        Some((name, ..)) => name,
+        None => meta.names[a].as_deref().unwrap_or(""),
+    };
+    let names: Vec<&str> = (lead..meta.shape.len()).map(name).collect();
+    let usual = &["z", "y", "x"][3 - names.len()..];
+    let known = names.iter().all(|n| ["z", "y", "x"].contains(n));
+    (known && names != usual).then(|| {
+        format!(
+            "its axes are named {}, slowest first; they are read and written by their place, as {}",
+            names.join(", "),
+            usual.join(", ")
+        )
+    })
+}
+
 /// Spacing, origin and unit of the space axes.
 fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut VolumeInfo) -> Result<()> {
     let mut unit: Option<Option<String>> = None;
@@ -222,6 +240,7 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     if let Some(m) = &multiscale {
         geometry(&folder, m, lead, n, &mut info)?;
     }
+    info.warnings.extend(other_order(&meta, multiscale.as_ref(), lead));
 
     let failed = |e: String| {
         let read = if e.contains("codec") { chunk_codecs::READ } else { "" };
