@@ -16,8 +16,8 @@ pub fn roomy(n: usize) -> usize {
 /// Element types with extremes in registers.
 pub trait RowExtremes: Sized {
     /// In every row `out_lo[i]` is the least of `lo[i..i + w]` and `out_hi[i]` the greatest of `hi[i..i + w]` for `i < n`,
-    /// with sources of `roomy(n)` elements and results of `n` rounded up to 64. Returns false, with nothing done, where the level
-    /// or the window asks for the tree.
+    /// with sources of `roomy(n)` and of `n + w + 63` elements, results of `n` rounded up to 64 and `work` twice `n + w + 63`.
+    /// Returns false, with nothing done, where the level asks for the tree.
     #[allow(clippy::too_many_arguments)]
     fn windows(
         _level: Level,
@@ -28,6 +28,7 @@ pub trait RowExtremes: Sized {
         _out_lo: &mut [Self],
         _out_hi: &mut [Self],
         _pitches: Pitches,
+        _work: &mut [Self],
     ) -> bool {
         false
     }
@@ -96,7 +97,7 @@ mod wide {
     }
 
     macro_rules! extremes {
-        ($($t:ident, $index:ident, $lanes:literal, $name:ident, $min:ident, $max:ident, $permute:ident;)*) => {$(
+        ($($t:ident, $index:ident, $lanes:literal, $name:ident, $long:ident, $min:ident, $max:ident, $permute:ident;)*) => {$(
             impl RowExtremes for $t {
                 fn windows(
                     level: Level,
@@ -107,8 +108,9 @@ mod wide {
                     out_lo: &mut [$t],
                     out_hi: &mut [$t],
                     pitches: Pitches,
+                    work: &mut [$t],
                 ) -> bool {
-                    if level != Level::Avx512 || w == 0 || w >= 2 * $lanes || w > SLACK + 1 {
+                    if level != Level::Avx512 || w == 0 {
                         return false;
                     }
                     let (from, to) = (lo.len().min(hi.len()), out_lo.len().min(out_hi.len()));
@@ -116,6 +118,14 @@ mod wide {
                         return true;
                     }
                     let last = pitches.rows - 1;
+                    if w >= 2 * $lanes || w > SLACK + 1 {
+                        let most = n + w + 63;
+                        assert!(last * pitches.from + most <= from && 2 * most <= work.len());
+                        assert!(last * pitches.to + n.next_multiple_of(64) <= to);
+                        // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
+                        unsafe { $long(lo, hi, w, n, out_lo, out_hi, pitches, work) };
+                        return true;
+                    }
                     assert!(last * pitches.from + roomy(n) <= from && last * pitches.to + n.next_multiple_of(64) <= to);
                     // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
                     unsafe {
@@ -130,6 +140,64 @@ mod wide {
                         }
                     }
                     true
+                }
+            }
+
+            /// Windows of a vector's length by doubling as in the other function, kept in `work`; those of `w` are joined from
+            /// them.
+            #[target_feature(enable = "avx512f,avx512bw,avx512vbmi")]
+            #[allow(clippy::too_many_arguments)]
+            unsafe fn $long(
+                lo: &[$t],
+                hi: &[$t],
+                w: usize,
+                n: usize,
+                out_lo: &mut [$t],
+                out_hi: &mut [$t],
+                pitches: Pitches,
+                work: &mut [$t],
+            ) {
+                const P: usize = ($lanes as usize).ilog2() as usize;
+                let mut shifts = [_mm512_setzero_si512(); 6];
+                for k in 0..P {
+                    let ramp: [$index; $lanes] = std::array::from_fn(|j| (j + (1 << k)) as $index);
+                    // SAFETY: a vector of indices.
+                    shifts[k] = unsafe { _mm512_loadu_si512(ramp.as_ptr().cast()) };
+                }
+                let (work_lo, work_hi) = work.split_at_mut(work.len() / 2);
+                // Windows of a vector's length that take part, and vectors of results.
+                let (short, vectors) = ((n + w - $lanes).div_ceil($lanes), n.div_ceil($lanes));
+                // SAFETY: less than `n + w + 63` elements, as the caller checked, in sources and halves of `work`.
+                macro_rules! at {
+                    ($s:ident, $i:expr) => { unsafe { _mm512_loadu_si512($s.as_ptr().add($i).cast()) } };
+                }
+                macro_rules! put {
+                    ($s:ident, $i:expr, $v:expr) => { unsafe { _mm512_storeu_si512($s.as_mut_ptr().add($i).cast(), $v) } };
+                }
+                for k in 0..pitches.rows {
+                    let (lo, hi) = (&lo[k * pitches.from..], &hi[k * pitches.from..]);
+                    let (out_lo, out_hi) = (&mut out_lo[k * pitches.to..], &mut out_hi[k * pitches.to..]);
+                    let (mut right_lo, mut right_hi) = ([at!(lo, short * $lanes); 6], [at!(hi, short * $lanes); 6]);
+                    for i in (0..short + 1).rev() {
+                        let (mut a, mut b) = (at!(lo, i * $lanes), at!(hi, i * $lanes));
+                        grow!(P, shifts, $min, $permute, a, right_lo; 0 1 2 3 4 5);
+                        grow!(P, shifts, $max, $permute, b, right_hi; 0 1 2 3 4 5);
+                        if i < short {
+                            put!(work_lo, i * $lanes, a);
+                            put!(work_hi, i * $lanes, b);
+                        }
+                    }
+                    for i in 0..vectors {
+                        let at = i * $lanes;
+                        let last = at + w - $lanes;
+                        let (mut least, mut most) = (at!(work_lo, last), at!(work_hi, last));
+                        for k in 0..w / $lanes {
+                            least = $min(least, at!(work_lo, at + k * $lanes));
+                            most = $max(most, at!(work_hi, at + k * $lanes));
+                        }
+                        put!(out_lo, at, least);
+                        put!(out_hi, at, most);
+                    }
                 }
             }
 
@@ -196,10 +264,10 @@ mod wide {
         )*};
     }
     extremes! {
-        u8, u8, 64, extremes_u8, _mm512_min_epu8, _mm512_max_epu8, _mm512_permutex2var_epi8;
-        u16, u16, 32, extremes_u16, _mm512_min_epu16, _mm512_max_epu16, _mm512_permutex2var_epi16;
-        u32, u32, 16, extremes_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
-        f32, u32, 16, extremes_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
+        u8, u8, 64, extremes_u8, long_u8, _mm512_min_epu8, _mm512_max_epu8, _mm512_permutex2var_epi8;
+        u16, u16, 32, extremes_u16, long_u16, _mm512_min_epu16, _mm512_max_epu16, _mm512_permutex2var_epi16;
+        u32, u32, 16, extremes_u32, long_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
+        f32, u32, 16, extremes_f32, long_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
     }
 
     /// Lane j of a part takes lane j + lane of a vector and its right neighbour.
@@ -301,12 +369,13 @@ mod tests {
 
     fn check_extremes<T: lines::Elem>(of: impl Fn(u32) -> T) {
         for level in Level::available() {
-            for w in (1..=67).chain([127, 128]) {
+            for w in (1..=67).chain([127, 128, 129, 200, 255, 333]) {
                 for n in [1, 15, 63, 64, 65, 130, 256] {
                     let (a, b) = (numbers(&of, roomy(n) + w + 7), numbers(|i| of(i ^ 0x5a5a_5a5a), roomy(n) + w + 7));
+                    let mut work = vec![T::LEAST; 2 * (n + w + 63)];
                     let (mut lo, mut hi) = (vec![T::LEAST; 2 * roomy(n)], vec![T::LEAST; 2 * roomy(n)]);
                     let pitches = Pitches { from: 7, to: roomy(n) - 5, rows: 2 };
-                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi, pitches) {
+                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi, pitches, &mut work) {
                         for (k, i) in (0..2).flat_map(|k| (0..n).map(move |i| (k, i))) {
                             let (from, to) = (k * pitches.from + i, k * pitches.to + i);
                             let least = a[from..from + w].iter().fold(T::GREATEST, |m, v| m.lo(*v));
@@ -314,7 +383,7 @@ mod tests {
                             assert!(lo[to] == least && hi[to] == most, "{level:?} {w} {n} {k} {i}");
                         }
                     } else {
-                        assert!(level < Level::Avx512 || w > 15);
+                        assert!(level < Level::Avx512);
                     }
                 }
             }

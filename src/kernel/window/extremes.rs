@@ -2,7 +2,7 @@
 //! of lines where windows are long.
 
 use super::lines::{Block, Coding, Elem, Lines, Masked, Sources};
-use super::plan::Job;
+use super::plan::{Job, Tile};
 use crate::kernel::simd::Level;
 
 crate::multiversion! {
@@ -282,29 +282,31 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
     }
 }
 
-/// Extremes over y of a block of output rows from `j` on.
+/// Extremes over y of a block of output rows from planes of columns that exist; `lines` are those of their windows.
 #[allow(clippy::too_many_arguments)]
 pub fn rows_extremes<T: Elem>(
     level: Level,
     job: &Job,
+    tile: &Tile,
     from: [&[T]; 2],
-    j: usize,
-    plain: Coding<T>,
+    lines: Lines,
     lo: &mut [T],
     hi: &mut [T],
     work: &mut [T],
 ) {
-    let lines = Lines { base: 0, pitch: job.pitch, first: j as isize, clip: (0, job.height as isize) };
-    let (w, out) = (job.window[1], (0, job.pitch));
+    let plain = Coding { flip: T::default(), missing: T::default() };
+    // Where few columns exist, neutral ones behind them make a chunk; what sticks out of a row is neutral in the next too.
+    let (cols, out) = (tile.columns().max(T::CHUNK.as_ref().len()), (tile.cols.0, job.pitch));
+    let (outputs, w) = ((job.rows, job.row_block), job.window[1]);
     blocked(
         level,
-        (job.rows, job.row_block),
+        outputs,
         Masked::<false>,
         Sources::<true>,
         from,
         lines,
         w,
-        job.columns(),
+        cols,
         plain,
         lo,
         hi,

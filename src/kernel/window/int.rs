@@ -154,10 +154,10 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
     masked: bool,
 ) -> usize {
     let k = job.needs.extremes as usize;
-    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
+    let planes = 2 * padded::<T>(job.batch * job.narrow_plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
     let stage = padded::<T>(Stage::len(job, size_of::<T>()));
     let rows =
-        stage + padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(ROWS * job.out_pitch());
+        stage + padded::<T>(2 * (job.pitch + SLACK)) + padded::<T>(deep_len(job)) + 2 * padded::<T>(ROWS * job.out_pitch());
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
@@ -392,11 +392,11 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let needs = job.needs;
     let bytes = &mut scratch;
     let k = needs.extremes as usize;
-    let lo = cut::<T>(bytes, k * job.batch * job.plane());
-    let hi = cut::<T>(bytes, k * job.batch * job.plane());
+    let lo = cut::<T>(bytes, k * job.batch * job.narrow_plane());
+    let hi = cut::<T>(bytes, k * job.batch * job.narrow_plane());
     let row_lo = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
-    let work = cut::<T>(bytes, k * 2 * job.pitch);
+    let work = cut::<T>(bytes, k * 2 * (job.pitch + SLACK));
     let deep = cut::<T>(bytes, k * deep_len(job));
     let out_lo = cut::<T>(bytes, k * ROWS * job.out_pitch());
     let out_hi = cut::<T>(bytes, k * ROWS * job.out_pitch());
@@ -408,14 +408,17 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let [n, inverse] = [(); 2].map(|()| ROWS * job.out_pitch());
     let mut counts = Counts { columns, n: cut(bytes, n), inverse: cut(bytes, inverse), made: [0; ROWS] };
     let coding = Coding { flip, missing: missing.unwrap_or_default() };
-    let plain = Coding { flip: T::default(), missing: T::default() };
     let (most, divides) = (job.counts().0, emit.divides());
     let width = Width::of(most, T::TOP);
     for tile in Tile::all(job) {
         let (y, x) = (tile.y, tile.x);
         counts.begin_tile(job, &tile);
-        lo.fill(T::GREATEST);
-        hi.fill(T::LEAST);
+        if tile.columns() < T::CHUNK.as_ref().len() {
+            lo.fill(T::GREATEST);
+            hi.fill(T::LEAST);
+        }
+        row_lo.fill(T::GREATEST);
+        row_hi.fill(T::LEAST);
         s1.plane.fill(Z1::default());
         s2.plane.fill(Z2::default());
         count.plane.fill(0);
@@ -466,13 +469,14 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                 if M {
                     count.begin_rows(level, job);
                 }
-                let plane = (z - z0) * job.plane();
+                let plane = (z - z0) * job.narrow_plane()..(z - z0 + 1) * job.narrow_plane();
                 for j in (0..tile.size[0]).step_by(ROWS) {
                     let rows = ROWS.min(tile.size[0] - j);
                     if needs.extremes {
                         if j % job.rows == 0 {
-                            let from = [&lo[plane..plane + job.plane()], &hi[plane..plane + job.plane()]];
-                            rows_extremes(level, job, from, j, plain, row_lo, row_hi, deep);
+                            let from = [&lo[plane.clone()], &hi[plane.clone()]];
+                            let lines = tile.lines(job, j);
+                            rows_extremes(level, job, &tile, from, lines, row_lo, row_hi, deep);
                         }
                         let line = (j % job.rows) * job.pitch;
                         let (w, n) = (job.window[2], job.tile[1]);
@@ -534,11 +538,11 @@ fn planes_extremes<T: Code + Plain, const M: bool>(
     work: &mut [T],
     buffer: &mut [T],
 ) {
-    let cols = tile.cols.1 - tile.cols.0;
+    let cols = tile.columns();
     let stage = Stage::new(job, size_of::<T>(), z0);
     for j in tile.rows.0..tile.rows.1 {
         let (from, lines) = stage.fill(tile, src, j, buffer);
-        let out = (tile.span(job, j).start, job.plane());
+        let out = ((j - tile.rows.0) * job.narrow, job.narrow_plane());
         blocked(
             level,
             (job.batch, job.block),

@@ -71,6 +71,8 @@ pub struct Job {
     pub row_block: usize,
     /// Elements from row to row of tile buffers.
     pub pitch: usize,
+    /// The same where only columns that exist are kept.
+    pub narrow: usize,
     /// Rows of tile buffers.
     pub height: usize,
 }
@@ -86,6 +88,7 @@ impl Job {
         }
         let width = even(dst[2], MAX_WIDTH);
         let pitch = odd_lines(width + 2 * radius[2]);
+        let narrow = odd_lines((width + 2 * radius[2]).min(src[2]));
         let planes = block(window[0], dst[0]);
         // Each batch makes the groups of extremes anew, so long windows want deep batches.
         let deep = if window[0] < DEEP { 1 } else { 4 };
@@ -95,9 +98,9 @@ impl Job {
         let tile = [even(dst[1], rows).next_multiple_of(ROWS).min(dst[1]), width];
         let height = tile[0] + 2 * radius[1];
         let row_block = block(window[1], tile[0]);
-        let rows = if window[1] < DEEP { ROWS } else { row_block * 4.min(tile[0].div_ceil(row_block)) };
-        let skip = [0; 3];
-        Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+        let rows = if window[1] < DEEP { ROWS } else { row_block * LONG_ROWS.min(tile[0].div_ceil(row_block)) };
+        let (skip, block) = ([0; 3], planes);
+        Job { src, dst, at, skip, radius, window, needs, tile, batch, block, rows, row_block, pitch, narrow, height }
     }
 
     /// Float windows come in blocks of eight that start at multiples of eight of the volume, and so do tiles and batches.
@@ -107,15 +110,17 @@ impl Job {
         let most = dst.map(|n| (n + BLOCK - 1).next_multiple_of(BLOCK));
         let width = most[2].min(FLOAT_WIDTH);
         let pitch = odd_lines(width + 2 * radius[2]);
+        // Vectors start at multiples of eight of the tile.
+        let narrow = odd_lines((width + 2 * radius[2]).min(src[2] + 2 * (BLOCK - 1)));
         // Groups along z are made anew by each batch.
         let batch = most[0].min(BLOCK * if window[0] < DEEP { 1 } else { 4 });
         let rows = (FLOAT_TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
         let tile = [most[1].min(rows.max(2 * radius[1]).next_multiple_of(BLOCK)), width];
         let height = tile[0] + 2 * radius[1];
         let (planes, row_block) = (block(window[0], batch), block(window[1], tile[0]));
-        let rows = row_block * if window[1] < DEEP { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
-        let (at, skip) = ([0; 3], [0; 3]);
-        Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+        let rows = row_block * if window[1] < DEEP { 1 } else { LONG_ROWS.min(tile[0].div_ceil(row_block)) };
+        let (at, skip, block) = ([0; 3], [0; 3], planes);
+        Job { src, dst, at, skip, radius, window, needs, tile, batch, block, rows, row_block, pitch, narrow, height }
     }
 
     /// Starts `phase` outputs earlier.
@@ -158,11 +163,18 @@ impl Job {
     pub fn plane(&self) -> usize {
         self.height * self.pitch
     }
+
+    /// Elements of a plane of extremes: columns that exist, and of integers only the rows that do.
+    pub fn narrow_plane(&self) -> usize {
+        self.narrow * if self.needs.float { self.height } else { self.height.min(self.src[1]) }
+    }
 }
 
 /// Output rows of integers that go through x and the estimators together, so that few calls are made: a multiple of every
 /// block.
 pub const ROWS: usize = 8;
+/// Blocks of rows whose extremes along y are made together where windows are long.
+const LONG_ROWS: usize = 16;
 /// Widest tile in x.
 const MAX_WIDTH: usize = 512;
 /// The same for floats, whose planes hold sums of 8 and 16 bytes.
@@ -281,6 +293,17 @@ impl Tile {
     pub fn all(job: &Job) -> impl Iterator<Item = Tile> + '_ {
         let ys = (0..job.dst[1]).step_by(job.tile[0]);
         ys.flat_map(move |y| (0..job.dst[2]).step_by(job.tile[1]).map(move |x| Tile::new(job, y, x)))
+    }
+
+    /// Columns that exist.
+    pub fn columns(&self) -> usize {
+        self.cols.1 - self.cols.0
+    }
+
+    /// Lines of windows along y from output row `j` of the tile on, in a plane of the rows and columns that exist.
+    pub fn lines(&self, job: &Job, j: usize) -> Lines {
+        let clip = (0, (self.rows.1 - self.rows.0) as isize);
+        Lines { base: 0, pitch: job.narrow, first: j as isize - self.rows.0 as isize, clip }
     }
 
     /// Part of buffer row `j` that `src` covers, as element indices of a plane.
