@@ -350,8 +350,7 @@ impl<'a, T: Float> Extremes<'a, T> {
         if j.is_multiple_of(job.rows) {
             let plane = k * job.narrow_plane()..(k + 1) * job.narrow_plane();
             let from = [&self.lo[plane.clone()], &self.hi[plane]];
-            let lines =
-                lines::Lines { base: 0, pitch: job.narrow, first: j as isize, clip: (0, job.height as isize) };
+            let lines = lines::Lines { base: 0, pitch: job.narrow, first: j as isize, clip: (0, job.height as isize) };
             rows_extremes(level, job, tile, from, lines, self.row_lo, self.row_hi, self.deep);
         }
         let line = (j % job.rows) * job.pitch;

@@ -7,7 +7,7 @@
 use super::along::SLACK;
 use super::emit::{Emit, IntRows};
 use super::estimate::{self, Acc, Code, RowSum, Width};
-use super::extremes::{blocked, deep_len, rows_extremes};
+use super::extremes::{Groups, blocked, deep, deep_extremes, deep_len, rows_extremes, slots};
 use super::lines::{self, Add, Coding, Masked, Op, Pitches, Sources};
 use super::plan::{Job, Plain, ROWS, Stage, Tile, bits, cut, padded};
 use crate::grid::View;
@@ -156,8 +156,11 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
     let k = job.needs.extremes as usize;
     let planes = 2 * padded::<T>(job.batch * job.narrow_plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
     let stage = padded::<T>(Stage::len(job, size_of::<T>()));
-    let rows =
-        stage + padded::<T>(2 * (job.pitch + SLACK)) + padded::<T>(deep_len(job)) + 2 * padded::<T>(ROWS * job.out_pitch());
+    let rows = stage
+        + padded::<T>(kept_len(job))
+        + padded::<T>(2 * (job.pitch + SLACK))
+        + padded::<T>(deep_len(job))
+        + 2 * padded::<T>(ROWS * job.out_pitch());
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
@@ -398,6 +401,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let work = cut::<T>(bytes, k * 2 * (job.pitch + SLACK));
     let deep = cut::<T>(bytes, k * deep_len(job));
+    let kept = cut::<T>(bytes, k * kept_len(job));
     let out_lo = cut::<T>(bytes, k * ROWS * job.out_pitch());
     let out_hi = cut::<T>(bytes, k * ROWS * job.out_pitch());
     let stage = cut::<T>(bytes, k * Stage::len(job, size_of::<T>()));
@@ -453,7 +457,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
         }
         for z0 in (0..job.dst[0]).step_by(job.batch) {
             if needs.extremes {
-                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep, stage);
+                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, kept, stage);
             }
             for z in z0..(z0 + job.batch).min(job.dst[0]) {
                 let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
@@ -524,7 +528,13 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     }
 }
 
-/// Extremes over z of a batch of output planes, straight from `src`.
+/// Elements of the extremes of groups of planes that a tile keeps from batch to batch.
+fn kept_len(job: &Job) -> usize {
+    2 * slots(job.window[0], job.batch / 8) * job.narrow_plane()
+}
+
+/// Extremes over z of a batch of output planes, straight from `src`. Long windows are made of groups of planes, which stay in
+/// `kept`.
 #[allow(clippy::too_many_arguments)]
 fn planes_extremes<T: Code + Plain, const M: bool>(
     level: Level,
@@ -535,28 +545,27 @@ fn planes_extremes<T: Code + Plain, const M: bool>(
     coding: Coding<T>,
     lo: &mut [T],
     hi: &mut [T],
-    work: &mut [T],
+    kept: &mut [T],
     buffer: &mut [T],
 ) {
-    let cols = tile.columns();
+    let (cols, w, plane) = (tile.columns(), job.window[0], job.narrow_plane());
+    let (masked, sources) = (Masked::<M>, Sources::<false>);
     let stage = Stage::new(job, size_of::<T>(), z0);
     for j in tile.rows.0..tile.rows.1 {
+        let at = (j - tile.rows.0) * job.narrow;
+        if deep(w, cols, job.block, T::CHUNK.as_ref().len()) {
+            let lines = tile.column(job, src, j);
+            let blocks = (z0 / 8, (z0 + job.batch) / 8);
+            // Those of the batch before are there.
+            let from = if z0 == 0 { 1 } else { z0 / 8 + (w - 8) / 8 };
+            let groups = Groups { at, stride: plane, slots: slots(w, job.batch / 8), from };
+            let (src, out) = ([src.data; 2], (at, plane));
+            deep_extremes(level, masked, sources, src, lines, w, cols, coding, blocks, lo, hi, out, groups, kept);
+            continue;
+        }
         let (from, lines) = stage.fill(tile, src, j, buffer);
-        let out = ((j - tile.rows.0) * job.narrow, job.narrow_plane());
-        blocked(
-            level,
-            (job.batch, job.block),
-            Masked::<M>,
-            Sources::<false>,
-            [from; 2],
-            lines,
-            job.window[0],
-            cols,
-            coding,
-            lo,
-            hi,
-            out,
-            work,
-        );
+        let blocks = (job.batch, job.block);
+        let out = (at, plane);
+        blocked(level, blocks, masked, sources, [from; 2], lines, w, cols, coding, lo, hi, out, kept);
     }
 }
