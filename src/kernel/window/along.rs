@@ -1,6 +1,5 @@
-//! Windows along a row with AVX-512: extremes by doubling in registers (two-source permutes shift a vector into its
-//! neighbour), exact sums as differences of running sums. Other levels use the trees of [`super::lines`], which give the
-//! same bits: extremes do not depend on an order, and integer sums wrap.
+//! Extremes of windows along a row with AVX-512, by doubling in registers: two-source permutes shift a vector into its
+//! neighbour. Other levels use the trees of [`super::lines`], which give the same: extremes do not depend on an order.
 
 use super::lines::Pitches;
 use crate::kernel::simd::Level;
@@ -34,43 +33,22 @@ pub trait RowExtremes: Sized {
     }
 }
 
-/// Sum types with running sums along a row.
-pub trait RowSums: Sized {
-    /// In every row `out[i]` is the sum of `src[i..i + w]`, modulo the type, for `i < n`; `out` holds `n` and `src` `n + w - 1`
-    /// elements, rounded up to 64, `work` 64 more than `src`. Returns false, with nothing done, where the level asks for
-    /// the tree.
-    fn windows(
-        _level: Level,
-        _src: &[Self],
-        _w: usize,
-        _n: usize,
-        _out: &mut [Self],
-        _pitches: Pitches,
-        _work: &mut [Self],
-    ) -> bool {
-        false
-    }
-}
-
 impl RowExtremes for f64 {}
-impl RowSums for u128 {}
 
 #[cfg(not(target_arch = "x86_64"))]
 mod wide {
-    use super::{RowExtremes, RowSums};
+    use super::RowExtremes;
     impl RowExtremes for u8 {}
     impl RowExtremes for u16 {}
     impl RowExtremes for u32 {}
     impl RowExtremes for f32 {}
-    impl RowSums for u32 {}
-    impl RowSums for u64 {}
 }
 
 #[cfg(target_arch = "x86_64")]
 mod wide {
     use std::arch::x86_64::*;
 
-    use super::{Pitches, RowExtremes, RowSums, SLACK, roomy};
+    use super::{Pitches, RowExtremes, SLACK, roomy};
     use crate::kernel::simd::Level;
 
     #[inline]
@@ -269,93 +247,6 @@ mod wide {
         u32, u32, 16, extremes_u32, long_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
         f32, u32, 16, extremes_f32, long_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
     }
-
-    /// Lane j of a part takes lane j + lane of a vector and its right neighbour.
-    macro_rules! ramp {
-        ($name:ident, $t:ident, $n:literal) => {
-            const $name: [$t; $n] = {
-                let mut ramp = [0; $n];
-                let mut j = 0;
-                while j < $n {
-                    ramp[j] = j as $t;
-                    j += 1;
-                }
-                ramp
-            };
-        };
-    }
-    ramp!(RAMP_32, u32, 32);
-    ramp!(RAMP_64, u64, 16);
-
-    macro_rules! sums {
-        ($($t:ident, $lanes:literal, $name:ident, $add:ident, $sub:ident, $align:ident, $permute:ident, $shift2:ident, $set:ident, $ramp:ident, $($step:literal)*;)*) => {$(
-            impl RowSums for $t {
-                fn windows(
-                    level: Level,
-                    src: &[$t],
-                    w: usize,
-                    n: usize,
-                    out: &mut [$t],
-                    pitches: Pitches,
-                    work: &mut [$t],
-                ) -> bool {
-                    if level != Level::Avx512 || w == 0 {
-                        return false;
-                    }
-                    let len = (n + w - 1).next_multiple_of(64);
-                    let (from, to) = (pitches.rows.saturating_sub(1) * pitches.from, pitches.rows.saturating_sub(1) * pitches.to);
-                    assert!(from + len <= src.len() && len + 64 <= work.len() && to + n.next_multiple_of(64) <= out.len());
-                    // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
-                    unsafe { $name(src, w, n, out, pitches, work) };
-                    true
-                }
-            }
-
-            /// Sums before every element go to `work`; those to the ends of windows come from the newest two vectors.
-            #[target_feature(enable = "avx512f")]
-            unsafe fn $name(src: &[$t], w: usize, n: usize, out: &mut [$t], pitches: Pitches, work: &mut [$t]) {
-                let (zero, top) = (_mm512_setzero_si512(), $set($lanes - 1));
-                // Vectors between a window's start and its last element, and the lane of that.
-                let (behind, lane) = ((w - 1) / $lanes, (w - 1) % $lanes);
-                // SAFETY: `lane` is less than a vector.
-                let shift = unsafe { _mm512_loadu_si512($ramp[lane..lane + $lanes].as_ptr().cast()) };
-                let vectors = n.div_ceil($lanes);
-                for k in 0..pitches.rows {
-                    let (src, out) = (&src[k * pitches.from..], &mut out[k * pitches.to..]);
-                    let (mut carry, mut last) = (zero, zero);
-                    // A window may end in the vector after the last that holds an element of it.
-                    for i in 0..vectors + behind + 1 {
-                        let v = if i * $lanes < n + w - 1 {
-                            // SAFETY: whole vectors below the length rounded up to 64.
-                            unsafe { _mm512_loadu_si512(src.as_ptr().add(i * $lanes).cast()) }
-                        } else {
-                            zero
-                        };
-                        let mut p = v;
-                        $(p = $add(p, $align::<{ $lanes - $step }>(p, zero));)*
-                        let sum = $add(p, carry);
-                        carry = $add(carry, $permute(top, p));
-                        // SAFETY: `work` has room for the vectors of all elements and one more.
-                        unsafe { _mm512_storeu_si512(work.as_mut_ptr().add(i * $lanes).cast(), $sub(sum, v)) };
-                        if i > behind {
-                            let at = (i - behind - 1) * $lanes;
-                            let end = $shift2(last, shift, sum);
-                            // SAFETY: written above; `at` is less than `n`.
-                            unsafe {
-                                let before = _mm512_loadu_si512(work.as_ptr().add(at).cast());
-                                _mm512_storeu_si512(out.as_mut_ptr().add(at).cast(), $sub(end, before));
-                            }
-                        }
-                        last = sum;
-                    }
-                }
-            }
-        )*};
-    }
-    sums! {
-        u32, 16, sums_u32, _mm512_add_epi32, _mm512_sub_epi32, _mm512_alignr_epi32, _mm512_permutexvar_epi32, _mm512_permutex2var_epi32, _mm512_set1_epi32, RAMP_32, 1 2 4 8;
-        u64, 8, sums_u64, _mm512_add_epi64, _mm512_sub_epi64, _mm512_alignr_epi64, _mm512_permutexvar_epi64, _mm512_permutex2var_epi64, _mm512_set1_epi64, RAMP_64, 1 2 4;
-    }
 }
 
 #[cfg(test)]
@@ -396,35 +287,5 @@ mod tests {
         check_extremes(|i| (i >> 7) as u16);
         check_extremes(|i| i);
         check_extremes(|i| i as f32 - 1e8);
-    }
-
-    #[test]
-    fn running_sums_equal_direct_windows() {
-        for level in Level::available() {
-            for w in [1, 2, 3, 8, 15, 16, 17, 21, 64, 129, 401] {
-                for n in [1, 63, 64, 65, 250] {
-                    let len = usize::next_multiple_of(n + w - 1, 64);
-                    let (a, b) = (numbers(|i| i << 3, len + 7), numbers(|i| (i as u64) << 33, len + 7));
-                    let (mut s, mut t) = (vec![1; 2 * roomy(n)], vec![1; 2 * roomy(n)]);
-                    let pitches = Pitches { from: 7, to: roomy(n) - 5, rows: 2 };
-                    let done = <u32 as RowSums>::windows(level, &a, w, n, &mut s, pitches, &mut vec![7; len + 64]);
-                    let wide = <u64 as RowSums>::windows(level, &b, w, n, &mut t, pitches, &mut vec![7; len + 64]);
-                    assert!(done == wide && done == (level == Level::Avx512));
-                    for (k, i) in (0..2).flat_map(|k| (0..n * done as usize).map(move |i| (k, i))) {
-                        let (from, to) = (k * pitches.from + i, k * pitches.to + i);
-                        assert_eq!(
-                            s[to],
-                            a[from..from + w].iter().fold(0, |s: u32, v| s.wrapping_add(*v)),
-                            "{w} {n} {i}"
-                        );
-                        assert_eq!(
-                            t[to],
-                            b[from..from + w].iter().fold(0, |s: u64, v| s.wrapping_add(*v)),
-                            "{w} {n} {i}"
-                        );
-                    }
-                }
-            }
-        }
     }
 }

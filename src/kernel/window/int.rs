@@ -10,6 +10,7 @@ use super::estimate::{self, Acc, Code, RowSum, Width};
 use super::extremes::{Groups, blocked, deep, deep_extremes, deep_len, rows_extremes, slots};
 use super::lines::{self, Add, Coding, Masked, Op, Pitches, Sources};
 use super::plan::{Job, Plain, ROWS, Stage, Tile, bits, cut, padded};
+use super::slide::{Rows, Slide};
 use crate::grid::View;
 use crate::kernel::simd::Level;
 
@@ -302,7 +303,7 @@ fn widen_inner<Y: Acc, X: Acc + From<Y>>(from: &[Y], to: &mut [X]) {
     }
 }
 
-impl<Z: Acc, Y: Acc + Plain + From<Z>, X: Acc + Plain + From<Y>> Moment<'_, Z, Y, X>
+impl<Z: Acc, Y: Acc + Plain + From<Z>, X: Acc + Plain + From<Y> + Slide<Z, Y>> Moment<'_, Z, Y, X>
 where
     Add: Op<X>,
 {
@@ -318,6 +319,11 @@ where
     /// Sums of the windows of `rows` output rows from `y` of the tile on, left in `out`.
     fn finish_rows(&mut self, level: Level, job: &Job, y: usize, rows: usize) {
         let (w, n, pitch) = (job.window[2], job.tile[1], job.pitch);
+        let lines = Rows { plane: self.plane, pitch, first: y, rows, window: job.window[1] };
+        let run = &mut self.rows[..pitch];
+        if X::windows(level, lines, run, w, n, self.out, job.out_pitch(), self.work) {
+            return;
+        }
         slide_rows(level, self.plane, y, job.window[1], pitch, job.columns(), rows, self.rows);
         let made = &self.rows[pitch..][..rows * pitch];
         let from = if self.wide.is_empty() {
@@ -326,12 +332,9 @@ where
             widen(level, made, self.wide);
             &*self.wide
         };
-        let pitches = Pitches { from: pitch, to: job.out_pitch(), rows };
-        if !X::windows(level, from, w, n, self.out, pitches, self.work) {
-            for k in 0..rows {
-                let to = &mut self.out[k * pitches.to..][..n];
-                lines::tree_sum(level, &from[k * pitch..][..pitch], w, 1, to, self.work);
-            }
+        for k in 0..rows {
+            let to = &mut self.out[k * job.out_pitch()..][..n];
+            lines::tree_sum(level, &from[k * pitch..][..pitch], w, 1, to, self.work);
         }
         self.rows.copy_within(rows * pitch..(rows + 1) * pitch, 0);
     }
@@ -385,10 +388,10 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     T: Code + Plain,
     Z1: Acc + Plain + From<T>,
     Y1: Acc + Plain + From<Z1>,
-    X1: RowSum + Plain + From<Y1>,
+    X1: RowSum + Plain + From<Y1> + Slide<Z1, Y1>,
     Z2: Acc + Plain + From<T::Square>,
     Y2: Acc + Plain + From<Z2>,
-    X2: Acc + Plain + From<Y2>,
+    X2: Acc + Plain + From<Y2> + Slide<Z2, Y2>,
     Add: Op<X1> + Op<X2>,
 {
     let Setup { job, level, flip, missing } = *setup;
