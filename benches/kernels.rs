@@ -11,6 +11,8 @@ use occlude::kernel::window::{Place, WindowOut, reference, window};
 use occlude::stage::{Method, Ties, WindowChannel, WindowParams};
 
 const SHAPE: Shape = [415, 256, 256];
+/// Planes so large that most windows of radius 64 are whole, and several tiles lie beside each other.
+const WIDE: Shape = [96, 640, 640];
 
 /// A body with a skin in air: smooth, with noise, about like a CT head.
 fn phantom(dtype: DType, shape: Shape) -> Voxels {
@@ -18,20 +20,25 @@ fn phantom(dtype: DType, shape: Shape) -> Voxels {
     let mut state = 1u64;
     let mut v = Voxels::zeroed(dtype, shape.iter().product());
     let mut i = 0;
+    let at = |a: usize, c: usize| (c as f64 + 0.5) / shape[a] as f64 - 0.5;
+    let waves: [Vec<f64>; 2] = [
+        (0..shape[0]).map(|z| (40.0 * at(0, z)).sin()).collect(),
+        (0..shape[2]).map(|x| (30.0 * at(2, x)).cos()).collect(),
+    ];
     let mut next = || {
         state ^= state << 13;
         state ^= state >> 7;
         state ^= state << 17;
         let c = [i / (shape[1] * shape[2]), i / shape[2] % shape[1], i % shape[2]];
         i += 1;
-        let d: [f64; 3] = std::array::from_fn(|a| (c[a] as f64 + 0.5) / shape[a] as f64 - 0.5);
+        let d: [f64; 3] = std::array::from_fn(|a| at(a, c[a]));
         let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
         let tissue = if r > 0.45 {
             0.05
         } else if r > 0.4 {
             0.8
         } else {
-            0.4 + 0.1 * (40.0 * d[0]).sin() * (30.0 * d[2]).cos()
+            0.4 + 0.1 * waves[0][c[0]] * waves[1][c[2]]
         };
         let noise = (state >> 40) as f64 / (1u64 << 24) as f64 - 0.5;
         lo + (tissue + 0.05 * noise) * (hi - lo)
@@ -155,11 +162,11 @@ fn main() {
             }
             for radius in [10, 64] {
                 for level in Level::available().into_iter().rev() {
-                    for data in ["phantom", "missing"] {
+                    for data in ["phantom", "missing", "wide"] {
                         let tag = format!("{data}_r{radius}");
                         let line = format!("{name} {dtype} {tag} {level:?}");
                         let usual =
-                            level != Level::Baseline && data != "missing" && !matches!(dtype, DType::I8 | DType::I16);
+                            level != Level::Baseline && data == "phantom" && !matches!(dtype, DType::I8 | DType::I16);
                         if filters.is_empty() && !usual || !filters.iter().all(|f| line.contains(f.as_str())) {
                             continue;
                         }
@@ -186,12 +193,16 @@ fn main() {
                             }
                             masked = Some(v);
                         }
-                        let src = masked.as_ref().unwrap_or(volume).view(SHAPE);
-                        let mut dst = outputs(dtype, SHAPE, channels, coded);
+                        let shape = if data == "wide" { WIDE } else { SHAPE };
+                        let wide = (data == "wide").then(|| phantom(dtype, WIDE));
+                        let src = masked.as_ref().or(wide.as_ref()).unwrap_or(volume).view(shape);
+                        let mut dst = outputs(dtype, shape, channels, coded);
                         let mut scratch = Scratch::new();
                         let t = best(|| {
-                            call(src, &mut dst, SHAPE, channels, &p, &mut Context { level, scratch: &mut scratch });
+                            call(src, &mut dst, shape, channels, &p, &mut Context { level, scratch: &mut scratch });
                         });
+                        // Per voxel, also of another volume.
+                        let t = t * voxels / shape.iter().product::<usize>() as f64;
                         let (ns, rate) = (t / voxels * 1e9, voxels / t / 1e6);
                         let level = format!("{level:?}");
                         println!(

@@ -1,6 +1,5 @@
-//! Windows along a row with AVX-512: extremes by doubling in registers (two-source permutes shift a vector into its
-//! neighbour), exact sums as differences of running sums. Other levels use the trees of [`super::lines`], which give the
-//! same bits: extremes do not depend on an order, and integer sums wrap.
+//! Extremes of windows along a row with AVX-512, by doubling in registers: two-source permutes shift a vector into its
+//! neighbour. Other levels use the trees of [`super::lines`], which give the same: extremes do not depend on an order.
 
 use super::lines::Pitches;
 use crate::kernel::simd::Level;
@@ -16,8 +15,8 @@ pub fn roomy(n: usize) -> usize {
 /// Element types with extremes in registers.
 pub trait RowExtremes: Sized {
     /// In every row `out_lo[i]` is the least of `lo[i..i + w]` and `out_hi[i]` the greatest of `hi[i..i + w]` for `i < n`,
-    /// with sources of `roomy(n)` elements and results of `n` rounded up to 64. Returns false, with nothing done, where the level
-    /// or the window asks for the tree.
+    /// with sources of `roomy(n)` and of `n + w + 63` elements, results of `n` rounded up to 64 and `work` twice `n + w + 63`.
+    /// Returns false, with nothing done, where the level asks for the tree.
     #[allow(clippy::too_many_arguments)]
     fn windows(
         _level: Level,
@@ -28,23 +27,6 @@ pub trait RowExtremes: Sized {
         _out_lo: &mut [Self],
         _out_hi: &mut [Self],
         _pitches: Pitches,
-    ) -> bool {
-        false
-    }
-}
-
-/// Sum types with running sums along a row.
-pub trait RowSums: Sized {
-    /// In every row `out[i]` is the sum of `src[i..i + w]`, modulo the type, for `i < n`; `out` holds `n` and `src` `n + w - 1`
-    /// elements, rounded up to 64, `work` 64 more than `src`. Returns false, with nothing done, where the level asks for
-    /// the tree.
-    fn windows(
-        _level: Level,
-        _src: &[Self],
-        _w: usize,
-        _n: usize,
-        _out: &mut [Self],
-        _pitches: Pitches,
         _work: &mut [Self],
     ) -> bool {
         false
@@ -52,24 +34,21 @@ pub trait RowSums: Sized {
 }
 
 impl RowExtremes for f64 {}
-impl RowSums for u128 {}
 
 #[cfg(not(target_arch = "x86_64"))]
 mod wide {
-    use super::{RowExtremes, RowSums};
+    use super::RowExtremes;
     impl RowExtremes for u8 {}
     impl RowExtremes for u16 {}
     impl RowExtremes for u32 {}
     impl RowExtremes for f32 {}
-    impl RowSums for u32 {}
-    impl RowSums for u64 {}
 }
 
 #[cfg(target_arch = "x86_64")]
 mod wide {
     use std::arch::x86_64::*;
 
-    use super::{Pitches, RowExtremes, RowSums, SLACK, roomy};
+    use super::{Pitches, RowExtremes, SLACK, roomy};
     use crate::kernel::simd::Level;
 
     #[inline]
@@ -96,7 +75,7 @@ mod wide {
     }
 
     macro_rules! extremes {
-        ($($t:ident, $index:ident, $lanes:literal, $name:ident, $min:ident, $max:ident, $permute:ident;)*) => {$(
+        ($($t:ident, $index:ident, $lanes:literal, $name:ident, $long:ident, $min:ident, $max:ident, $permute:ident;)*) => {$(
             impl RowExtremes for $t {
                 fn windows(
                     level: Level,
@@ -107,8 +86,9 @@ mod wide {
                     out_lo: &mut [$t],
                     out_hi: &mut [$t],
                     pitches: Pitches,
+                    work: &mut [$t],
                 ) -> bool {
-                    if level != Level::Avx512 || w == 0 || w >= 2 * $lanes || w > SLACK + 1 {
+                    if level != Level::Avx512 || w == 0 {
                         return false;
                     }
                     let (from, to) = (lo.len().min(hi.len()), out_lo.len().min(out_hi.len()));
@@ -116,6 +96,14 @@ mod wide {
                         return true;
                     }
                     let last = pitches.rows - 1;
+                    if w >= 2 * $lanes || w > SLACK + 1 {
+                        let most = n + w + 63;
+                        assert!(last * pitches.from + most <= from && 2 * most <= work.len());
+                        assert!(last * pitches.to + n.next_multiple_of(64) <= to);
+                        // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
+                        unsafe { $long(lo, hi, w, n, out_lo, out_hi, pitches, work) };
+                        return true;
+                    }
                     assert!(last * pitches.from + roomy(n) <= from && last * pitches.to + n.next_multiple_of(64) <= to);
                     // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
                     unsafe {
@@ -130,6 +118,64 @@ mod wide {
                         }
                     }
                     true
+                }
+            }
+
+            /// Windows of a vector's length by doubling as in the other function, kept in `work`; those of `w` are joined from
+            /// them.
+            #[target_feature(enable = "avx512f,avx512bw,avx512vbmi")]
+            #[allow(clippy::too_many_arguments)]
+            unsafe fn $long(
+                lo: &[$t],
+                hi: &[$t],
+                w: usize,
+                n: usize,
+                out_lo: &mut [$t],
+                out_hi: &mut [$t],
+                pitches: Pitches,
+                work: &mut [$t],
+            ) {
+                const P: usize = ($lanes as usize).ilog2() as usize;
+                let mut shifts = [_mm512_setzero_si512(); 6];
+                for k in 0..P {
+                    let ramp: [$index; $lanes] = std::array::from_fn(|j| (j + (1 << k)) as $index);
+                    // SAFETY: a vector of indices.
+                    shifts[k] = unsafe { _mm512_loadu_si512(ramp.as_ptr().cast()) };
+                }
+                let (work_lo, work_hi) = work.split_at_mut(work.len() / 2);
+                // Windows of a vector's length that take part, and vectors of results.
+                let (short, vectors) = ((n + w - $lanes).div_ceil($lanes), n.div_ceil($lanes));
+                // SAFETY: less than `n + w + 63` elements, as the caller checked, in sources and halves of `work`.
+                macro_rules! at {
+                    ($s:ident, $i:expr) => { unsafe { _mm512_loadu_si512($s.as_ptr().add($i).cast()) } };
+                }
+                macro_rules! put {
+                    ($s:ident, $i:expr, $v:expr) => { unsafe { _mm512_storeu_si512($s.as_mut_ptr().add($i).cast(), $v) } };
+                }
+                for k in 0..pitches.rows {
+                    let (lo, hi) = (&lo[k * pitches.from..], &hi[k * pitches.from..]);
+                    let (out_lo, out_hi) = (&mut out_lo[k * pitches.to..], &mut out_hi[k * pitches.to..]);
+                    let (mut right_lo, mut right_hi) = ([at!(lo, short * $lanes); 6], [at!(hi, short * $lanes); 6]);
+                    for i in (0..short + 1).rev() {
+                        let (mut a, mut b) = (at!(lo, i * $lanes), at!(hi, i * $lanes));
+                        grow!(P, shifts, $min, $permute, a, right_lo; 0 1 2 3 4 5);
+                        grow!(P, shifts, $max, $permute, b, right_hi; 0 1 2 3 4 5);
+                        if i < short {
+                            put!(work_lo, i * $lanes, a);
+                            put!(work_hi, i * $lanes, b);
+                        }
+                    }
+                    for i in 0..vectors {
+                        let at = i * $lanes;
+                        let last = at + w - $lanes;
+                        let (mut least, mut most) = (at!(work_lo, last), at!(work_hi, last));
+                        for k in 0..w / $lanes {
+                            least = $min(least, at!(work_lo, at + k * $lanes));
+                            most = $max(most, at!(work_hi, at + k * $lanes));
+                        }
+                        put!(out_lo, at, least);
+                        put!(out_hi, at, most);
+                    }
                 }
             }
 
@@ -196,97 +242,10 @@ mod wide {
         )*};
     }
     extremes! {
-        u8, u8, 64, extremes_u8, _mm512_min_epu8, _mm512_max_epu8, _mm512_permutex2var_epi8;
-        u16, u16, 32, extremes_u16, _mm512_min_epu16, _mm512_max_epu16, _mm512_permutex2var_epi16;
-        u32, u32, 16, extremes_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
-        f32, u32, 16, extremes_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
-    }
-
-    /// Lane j of a part takes lane j + lane of a vector and its right neighbour.
-    macro_rules! ramp {
-        ($name:ident, $t:ident, $n:literal) => {
-            const $name: [$t; $n] = {
-                let mut ramp = [0; $n];
-                let mut j = 0;
-                while j < $n {
-                    ramp[j] = j as $t;
-                    j += 1;
-                }
-                ramp
-            };
-        };
-    }
-    ramp!(RAMP_32, u32, 32);
-    ramp!(RAMP_64, u64, 16);
-
-    macro_rules! sums {
-        ($($t:ident, $lanes:literal, $name:ident, $add:ident, $sub:ident, $align:ident, $permute:ident, $shift2:ident, $set:ident, $ramp:ident, $($step:literal)*;)*) => {$(
-            impl RowSums for $t {
-                fn windows(
-                    level: Level,
-                    src: &[$t],
-                    w: usize,
-                    n: usize,
-                    out: &mut [$t],
-                    pitches: Pitches,
-                    work: &mut [$t],
-                ) -> bool {
-                    if level != Level::Avx512 || w == 0 {
-                        return false;
-                    }
-                    let len = (n + w - 1).next_multiple_of(64);
-                    let (from, to) = (pitches.rows.saturating_sub(1) * pitches.from, pitches.rows.saturating_sub(1) * pitches.to);
-                    assert!(from + len <= src.len() && len + 64 <= work.len() && to + n.next_multiple_of(64) <= out.len());
-                    // SAFETY: the level says that the CPU has AVX-512; the lengths were checked.
-                    unsafe { $name(src, w, n, out, pitches, work) };
-                    true
-                }
-            }
-
-            /// Sums before every element go to `work`; those to the ends of windows come from the newest two vectors.
-            #[target_feature(enable = "avx512f")]
-            unsafe fn $name(src: &[$t], w: usize, n: usize, out: &mut [$t], pitches: Pitches, work: &mut [$t]) {
-                let (zero, top) = (_mm512_setzero_si512(), $set($lanes - 1));
-                // Vectors between a window's start and its last element, and the lane of that.
-                let (behind, lane) = ((w - 1) / $lanes, (w - 1) % $lanes);
-                // SAFETY: `lane` is less than a vector.
-                let shift = unsafe { _mm512_loadu_si512($ramp[lane..lane + $lanes].as_ptr().cast()) };
-                let vectors = n.div_ceil($lanes);
-                for k in 0..pitches.rows {
-                    let (src, out) = (&src[k * pitches.from..], &mut out[k * pitches.to..]);
-                    let (mut carry, mut last) = (zero, zero);
-                    // A window may end in the vector after the last that holds an element of it.
-                    for i in 0..vectors + behind + 1 {
-                        let v = if i * $lanes < n + w - 1 {
-                            // SAFETY: whole vectors below the length rounded up to 64.
-                            unsafe { _mm512_loadu_si512(src.as_ptr().add(i * $lanes).cast()) }
-                        } else {
-                            zero
-                        };
-                        let mut p = v;
-                        $(p = $add(p, $align::<{ $lanes - $step }>(p, zero));)*
-                        let sum = $add(p, carry);
-                        carry = $add(carry, $permute(top, p));
-                        // SAFETY: `work` has room for the vectors of all elements and one more.
-                        unsafe { _mm512_storeu_si512(work.as_mut_ptr().add(i * $lanes).cast(), $sub(sum, v)) };
-                        if i > behind {
-                            let at = (i - behind - 1) * $lanes;
-                            let end = $shift2(last, shift, sum);
-                            // SAFETY: written above; `at` is less than `n`.
-                            unsafe {
-                                let before = _mm512_loadu_si512(work.as_ptr().add(at).cast());
-                                _mm512_storeu_si512(out.as_mut_ptr().add(at).cast(), $sub(end, before));
-                            }
-                        }
-                        last = sum;
-                    }
-                }
-            }
-        )*};
-    }
-    sums! {
-        u32, 16, sums_u32, _mm512_add_epi32, _mm512_sub_epi32, _mm512_alignr_epi32, _mm512_permutexvar_epi32, _mm512_permutex2var_epi32, _mm512_set1_epi32, RAMP_32, 1 2 4 8;
-        u64, 8, sums_u64, _mm512_add_epi64, _mm512_sub_epi64, _mm512_alignr_epi64, _mm512_permutexvar_epi64, _mm512_permutex2var_epi64, _mm512_set1_epi64, RAMP_64, 1 2 4;
+        u8, u8, 64, extremes_u8, long_u8, _mm512_min_epu8, _mm512_max_epu8, _mm512_permutex2var_epi8;
+        u16, u16, 32, extremes_u16, long_u16, _mm512_min_epu16, _mm512_max_epu16, _mm512_permutex2var_epi16;
+        u32, u32, 16, extremes_u32, long_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
+        f32, u32, 16, extremes_f32, long_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
     }
 }
 
@@ -301,12 +260,13 @@ mod tests {
 
     fn check_extremes<T: lines::Elem>(of: impl Fn(u32) -> T) {
         for level in Level::available() {
-            for w in (1..=67).chain([127, 128]) {
+            for w in (1..=67).chain([127, 128, 129, 200, 255, 333]) {
                 for n in [1, 15, 63, 64, 65, 130, 256] {
                     let (a, b) = (numbers(&of, roomy(n) + w + 7), numbers(|i| of(i ^ 0x5a5a_5a5a), roomy(n) + w + 7));
+                    let mut work = vec![T::LEAST; 2 * (n + w + 63)];
                     let (mut lo, mut hi) = (vec![T::LEAST; 2 * roomy(n)], vec![T::LEAST; 2 * roomy(n)]);
                     let pitches = Pitches { from: 7, to: roomy(n) - 5, rows: 2 };
-                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi, pitches) {
+                    if <T as RowExtremes>::windows(level, &a, &b, w, n, &mut lo, &mut hi, pitches, &mut work) {
                         for (k, i) in (0..2).flat_map(|k| (0..n).map(move |i| (k, i))) {
                             let (from, to) = (k * pitches.from + i, k * pitches.to + i);
                             let least = a[from..from + w].iter().fold(T::GREATEST, |m, v| m.lo(*v));
@@ -314,7 +274,7 @@ mod tests {
                             assert!(lo[to] == least && hi[to] == most, "{level:?} {w} {n} {k} {i}");
                         }
                     } else {
-                        assert!(level < Level::Avx512 || w > 15);
+                        assert!(level < Level::Avx512);
                     }
                 }
             }
@@ -327,35 +287,5 @@ mod tests {
         check_extremes(|i| (i >> 7) as u16);
         check_extremes(|i| i);
         check_extremes(|i| i as f32 - 1e8);
-    }
-
-    #[test]
-    fn running_sums_equal_direct_windows() {
-        for level in Level::available() {
-            for w in [1, 2, 3, 8, 15, 16, 17, 21, 64, 129, 401] {
-                for n in [1, 63, 64, 65, 250] {
-                    let len = usize::next_multiple_of(n + w - 1, 64);
-                    let (a, b) = (numbers(|i| i << 3, len + 7), numbers(|i| (i as u64) << 33, len + 7));
-                    let (mut s, mut t) = (vec![1; 2 * roomy(n)], vec![1; 2 * roomy(n)]);
-                    let pitches = Pitches { from: 7, to: roomy(n) - 5, rows: 2 };
-                    let done = <u32 as RowSums>::windows(level, &a, w, n, &mut s, pitches, &mut vec![7; len + 64]);
-                    let wide = <u64 as RowSums>::windows(level, &b, w, n, &mut t, pitches, &mut vec![7; len + 64]);
-                    assert!(done == wide && done == (level == Level::Avx512));
-                    for (k, i) in (0..2).flat_map(|k| (0..n * done as usize).map(move |i| (k, i))) {
-                        let (from, to) = (k * pitches.from + i, k * pitches.to + i);
-                        assert_eq!(
-                            s[to],
-                            a[from..from + w].iter().fold(0, |s: u32, v| s.wrapping_add(*v)),
-                            "{w} {n} {i}"
-                        );
-                        assert_eq!(
-                            t[to],
-                            b[from..from + w].iter().fold(0, |s: u64, v| s.wrapping_add(*v)),
-                            "{w} {n} {i}"
-                        );
-                    }
-                }
-            }
-        }
     }
 }

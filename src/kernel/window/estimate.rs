@@ -1,6 +1,5 @@
 //! From exact integer sums of one row of windows to results. Codes are unsigned: a stored value is `code - offset`.
 
-use super::along::RowSums;
 use super::beta::{self, Terms};
 use super::lines::Elem;
 use super::math;
@@ -8,7 +7,7 @@ use crate::kernel::simd::Level;
 use crate::kernel::singles::{F32x32, SINGLES};
 
 /// Integer that sums are kept in; arithmetic wraps, and the caller proves that final values fit.
-pub trait Acc: RowSums + Copy + Default + PartialOrd + std::fmt::Debug + 'static {
+pub trait Acc: Copy + Default + PartialOrd + std::fmt::Debug + 'static {
     fn plus(self, o: Self) -> Self;
     fn minus(self, o: Self) -> Self;
     fn wide(self) -> u128;
@@ -39,7 +38,6 @@ acc! {
     u64: |s| small(s);
     u128: |s| small(s as u64);
 }
-impl RowSums for u16 {}
 
 /// The integer that first sums of a row end in: u32 or u64.
 pub trait RowSum: Acc {

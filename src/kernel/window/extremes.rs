@@ -2,7 +2,7 @@
 //! of lines where windows are long.
 
 use super::lines::{Block, Coding, Elem, Lines, Masked, Sources};
-use super::plan::Job;
+use super::plan::{Job, Tile};
 use crate::kernel::simd::Level;
 
 crate::multiversion! {
@@ -195,18 +195,39 @@ unsafe fn extremes_chunk<T: Elem, const B: usize, const M: bool, const TWO: bool
 /// 2-core Zen 4 VM, AVX-512, 2026-11-23: cdf_power of u16, r=64, 11.9 ns/voxel against 23.1 with [`extremes`] alone.
 pub const DEEP: usize = 33;
 
-/// Elements of `work` that [`deep_extremes`] needs.
-fn groups_len(w: usize, blocks: usize, cols: usize) -> usize {
-    2 * cols * (w / 8 + blocks + 1)
+/// Where extremes of groups of lines are kept: of group `g` the least at `at + 2 (g % slots) stride`, the greatest `stride` on.
+/// Groups in front of `from` are there already.
+#[derive(Clone, Copy)]
+pub struct Groups {
+    pub at: usize,
+    pub stride: usize,
+    pub slots: usize,
+    pub from: usize,
+}
+
+impl Groups {
+    fn of(&self, g: usize) -> usize {
+        self.at + 2 * (g % self.slots) * self.stride
+    }
+}
+
+/// Whole groups that all windows of a block hold: lines 8..8 + 8 groups of the block.
+fn common(w: usize) -> usize {
+    (w - 8) / 8
+}
+
+/// Groups that the windows of `blocks` blocks ask for at a time.
+pub fn slots(w: usize, blocks: usize) -> usize {
+    if w < DEEP { 0 } else { common(w) + blocks }
 }
 
 crate::multiversion! {
-    /// [`extremes`] for long windows (`w >= DEEP`) and `8 * blocks` outputs: the extremes of each group of 8 lines are
-    /// made once, so a block reads its groups, and lines only at the window's ends. Whole lines are walked, since a
-    /// column of far planes would defeat the prefetcher. `cols` is at least a chunk.
+    /// [`extremes`] for long windows (`w >= DEEP`) and the blocks of 8 outputs `blocks`: the extremes of each group of 8 lines
+    /// are made once, so a block reads its groups, and lines only at the window's ends. Whole lines are walked, since a
+    /// column of far planes would defeat the prefetcher. `cols` is at least a chunk; output 8 `blocks.0` goes to `out.0`.
     pub fn deep_extremes[T: Elem, const M: bool, const TWO: bool](
         masked: Masked<M>, sources: Sources<TWO>, src: [&[T]; 2], lines: Lines, w: usize, cols: usize,
-        coding: Coding<T>, blocks: usize, lo: &mut [T], hi: &mut [T], out: (usize, usize), work: &mut [T]
+        coding: Coding<T>, blocks: (usize, usize), lo: &mut [T], hi: &mut [T], out: (usize, usize), kept: Groups, work: &mut [T]
     ) -> () = deep_inner;
 }
 
@@ -220,40 +241,42 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
     w: usize,
     cols: usize,
     coding: Coding<T>,
-    blocks: usize,
+    blocks: (usize, usize),
     lo: &mut [T],
     hi: &mut [T],
     out: (usize, usize),
+    kept: Groups,
     work: &mut [T],
 ) {
     let chunk = T::CHUNK.as_ref().len();
     let mut nothing = (T::CHUNK, T::CHUNK);
     nothing.0.as_mut().fill(T::GREATEST);
     nothing.1.as_mut().fill(T::LEAST);
-    let most = lines.start(8 * blocks + w - 2) + cols;
+    let most = lines.start(8 * blocks.1 + w - 2) + cols;
     assert!(cols >= chunk && most <= src[0].len() && most <= src[1].len());
     // SAFETY: starts grow with the line, and the last was checked with `cols >= x + chunk`.
     let join = |m, start: usize| unsafe { join_line::<T, M, TWO>(m, src, start, coding) };
-    // Whole groups that all windows of a block hold: lines 8..8 + 8 groups of the block.
-    let groups = (w - 8) / 8;
+    let groups = common(w);
     let steps = cols.div_ceil(chunk);
-    for g in 1..blocks + groups {
+    for g in kept.from.max(blocks.0 + 1)..blocks.1 + groups {
+        let at = kept.of(g);
         for s in 0..steps {
             let x = (s * chunk).min(cols - chunk);
             let mut m = nothing;
             for i in 8 * g..8 * g + 8 {
                 m = join(m, lines.start(i) + x);
             }
-            work[2 * g * cols + x..][..chunk].copy_from_slice(m.0.as_ref());
-            work[(2 * g + 1) * cols + x..][..chunk].copy_from_slice(m.1.as_ref());
+            work[at + x..][..chunk].copy_from_slice(m.0.as_ref());
+            work[at + kept.stride + x..][..chunk].copy_from_slice(m.1.as_ref());
         }
     }
-    for q in 0..blocks {
+    for q in blocks.0..blocks.1 {
         for s in 0..steps {
             let x = (s * chunk).min(cols - chunk);
             let mut core = nothing;
             for g in q + 1..q + 1 + groups {
-                let (a, b) = (&work[2 * g * cols + x..][..chunk], &work[(2 * g + 1) * cols + x..][..chunk]);
+                let at = kept.of(g) + x;
+                let (a, b) = (&work[at..][..chunk], &work[at + kept.stride..][..chunk]);
                 for i in 0..chunk {
                     core.0.as_mut()[i] = core.0.as_ref()[i].lo(a[i]);
                     core.1.as_mut()[i] = core.1.as_ref()[i].hi(b[i]);
@@ -271,7 +294,7 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
                 if k > 0 {
                     right = join(right, lines.start(8 * q + w + k - 1) + x);
                 }
-                let start = out.0 + (8 * q + k) * out.1 + x;
+                let start = out.0 + (8 * (q - blocks.0) + k) * out.1 + x;
                 let (to_lo, to_hi) = (&mut lo[start..start + chunk], &mut hi[start..start + chunk]);
                 for i in 0..chunk {
                     to_lo[i] = l.0.as_ref()[i].lo(right.0.as_ref()[i]);
@@ -282,35 +305,23 @@ fn deep_inner<T: Elem, const M: bool, const TWO: bool>(
     }
 }
 
-/// Extremes over y of a block of output rows from `j` on.
+/// Extremes over y of a block of output rows from planes of columns that exist; `lines` are those of their windows.
 #[allow(clippy::too_many_arguments)]
 pub fn rows_extremes<T: Elem>(
     level: Level,
     job: &Job,
+    tile: &Tile,
     from: [&[T]; 2],
-    j: usize,
-    plain: Coding<T>,
+    lines: Lines,
     lo: &mut [T],
     hi: &mut [T],
     work: &mut [T],
 ) {
-    let lines = Lines { base: 0, pitch: job.pitch, first: j as isize, clip: (0, job.height as isize) };
-    let (w, out) = (job.window[1], (0, job.pitch));
-    blocked(
-        level,
-        (job.rows, job.row_block),
-        Masked::<false>,
-        Sources::<true>,
-        from,
-        lines,
-        w,
-        job.columns(),
-        plain,
-        lo,
-        hi,
-        out,
-        work,
-    );
+    let plain = Coding { flip: T::default(), missing: T::default() };
+    // Where few columns exist, neutral ones behind them make a chunk; what sticks out of a row is neutral in the next too.
+    let (cols, out) = (tile.columns().max(T::CHUNK.as_ref().len()), (tile.cols.0, job.pitch));
+    let (outputs, w) = ((job.rows, job.row_block), job.window[1]);
+    blocked(level, outputs, Masked::<false>, Sources::<true>, from, lines, w, cols, plain, lo, hi, out, work);
 }
 
 /// Extremes of `outputs` lines from `lines` on, by blocks of a length known at run time, or by [`deep_extremes`].
@@ -330,8 +341,10 @@ pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
     out: (usize, usize),
     work: &mut [T],
 ) {
-    if w >= DEEP && block == 8 && outputs > 8 && cols >= T::CHUNK.as_ref().len() {
-        deep_extremes(level, masked, sources, src, lines, w, cols, coding, outputs / 8, lo, hi, out, work);
+    if deep(w, cols, block, T::CHUNK.as_ref().len()) {
+        let blocks = (0, outputs / 8);
+        let kept = Groups { at: 0, stride: cols, slots: slots(w, blocks.1), from: 1 };
+        deep_extremes(level, masked, sources, src, lines, w, cols, coding, blocks, lo, hi, out, kept, work);
         return;
     }
     for k in (0..outputs).step_by(block) {
@@ -346,9 +359,15 @@ pub fn blocked<T: Elem, const M: bool, const TWO: bool>(
     }
 }
 
+/// Whether [`deep_extremes`] makes windows of `w` lines of `cols` columns.
+pub fn deep(w: usize, cols: usize, block: usize, chunk: usize) -> bool {
+    w >= DEEP && block == 8 && cols >= chunk
+}
+
 /// Elements of work that both axes of [`blocked`] need.
 pub fn deep_len(job: &Job) -> usize {
-    groups_len(job.window[0].max(job.window[1]), job.batch.max(job.rows) / 8, job.pitch)
+    let of = |w: usize, outputs: usize| 2 * job.pitch * slots(w, outputs / 8);
+    of(job.window[0], job.batch).max(of(job.window[1], job.rows))
 }
 
 #[cfg(test)]
@@ -400,8 +419,16 @@ mod tests {
         for level in Level::available() {
             for w in [33, 35, 40, 64, 129, 301] {
                 let [mut lo, mut hi, mut a, mut b] = [(); 4].map(|()| vec![0u16; 32 * pitch]);
-                let mut work = vec![0u16; groups_len(w, 4, 90)];
-                deep_extremes(level, m, s, [&src; 2], lines, w, 90, coding, 4, &mut lo, &mut hi, (0, pitch), &mut work);
+                let mut work = vec![0u16; 7 + 2 * slots(w, 2) * 93];
+                // Two blocks at a time, which keep their groups.
+                for q in [0, 2] {
+                    let from = if q == 0 { 1 } else { q + common(w) };
+                    let kept = Groups { at: 7, stride: 93, slots: slots(w, 2), from };
+                    let (blocks, out) = ((q, q + 2), (8 * q * pitch, pitch));
+                    let (to, work) = ([&mut lo, &mut hi], &mut work);
+                    let [lo, hi] = to;
+                    deep_extremes(level, m, s, [&src; 2], lines, w, 90, coding, blocks, lo, hi, out, kept, work);
+                }
                 for k in 0..4 {
                     let out = (8 * k * pitch, pitch);
                     extremes(level, Block::<8>, m, s, [&src; 2], plain(k), w, 90, coding, &mut a, &mut b, out);

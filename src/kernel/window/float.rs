@@ -43,7 +43,7 @@ pub fn bytes<T: Float>(job: &Job) -> usize {
     Emit::bytes(job.tile[1], job.tile[1]) + padded::<T>(Lines::<T>::len(job)) + Extremes::<T>::bytes(job) + sums
 }
 
-/// The lines along z of one buffer row of a batch, side by side: planes lie a power of two apart in many volumes, and then
+/// The lines along z of one buffer row of a batch, side by side, from [`first`] column on: planes lie a power of two apart in many volumes, and then
 /// few cache sets hold all of a column, which extremes and sums both read. 2-core Zen 4 VM, AVX-512, 2026-11-23, 256 x 256
 /// planes, cdf_power r=10 of f32: 12.9 ns/voxel in place, 11.4 and 10.0 staged, in runs of their own on a busy machine.
 struct Lines<'a, T> {
@@ -57,7 +57,7 @@ struct Lines<'a, T> {
 impl<'a, T: Float> Lines<'a, T> {
     /// An odd number of cache lines.
     fn pitch(job: &Job) -> usize {
-        ((width(job) * size_of::<T>()).div_ceil(64) | 1) * 64 / size_of::<T>()
+        ((job.narrow * size_of::<T>()).div_ceil(64) | 1) * 64 / size_of::<T>()
     }
 
     fn len(job: &Job) -> usize {
@@ -78,11 +78,11 @@ impl<'a, T: Float> Lines<'a, T> {
 
     /// Copies the lines of buffer row `j`, which exists.
     fn fill(&mut self, tile: &Tile, src: View<T>, j: usize) {
-        let (y, cols) = (tile.rows.2 + j - tile.rows.0, tile.cols.1 - tile.cols.0);
+        let (y, cols, first) = (tile.rows.2 + j - tile.rows.0, tile.columns(), tile.cols.0 - first(tile));
         for i in self.exist.0..self.exist.1 {
             let z = (self.first + i as isize) as usize;
             let from = &src.row_at(z, y)[tile.cols.2..tile.cols.2 + cols];
-            self.buffer[i * self.pitch + tile.cols.0..][..cols].copy_from_slice(from);
+            self.buffer[i * self.pitch + first..][..cols].copy_from_slice(from);
             plan::fetch_below(src, [z, y, tile.cols.2], cols);
         }
     }
@@ -91,6 +91,17 @@ impl<'a, T: Float> Lines<'a, T> {
 /// Columns of a row of a tile with its halo, in whole vectors.
 fn width(job: &Job) -> usize {
     (job.tile[1] + 2 * job.radius[2]).next_multiple_of(LANES)
+}
+
+/// First column of a tile that sums are made for: the eight that hold its first column that exists. What lies outside is
+/// nothing, and costs nothing.
+fn first(tile: &Tile) -> usize {
+    tile.cols.0 / LANES * LANES
+}
+
+/// Columns from there on, in whole vectors.
+fn existing(tile: &Tile) -> usize {
+    (tile.cols.1 - first(tile)).next_multiple_of(LANES)
 }
 
 crate::multiversion! {
@@ -128,6 +139,9 @@ pub fn run<T: Float>(
     let mut sums = needs.mean.then(|| Buffers::<T::Total>::cut(job, wanted, bytes));
     for x in (0..job.dst[2]).step_by(job.tile[1]) {
         extremes.clear();
+        if let Some(sums) = &mut sums {
+            sums.columns.clear();
+        }
         for (z0, y) in corners(job) {
             let tile = Tile::new(job, y, x);
             // Rows that the tile above has made are kept.
@@ -146,7 +160,7 @@ pub fn run<T: Float>(
                     extremes.planes(level, job, &tile, j, &lines);
                 }
                 if let Some(sums) = sums.as_mut().filter(|_| exists) {
-                    sums.planes(level, wanted, job, z0, j, &lines);
+                    sums.planes(level, wanted, job, &tile, z0, j, &lines);
                 }
             }
             for z in z0.max(job.skip[0])..(z0 + job.batch).min(job.dst[0]) {
@@ -155,7 +169,7 @@ pub fn run<T: Float>(
                 }
                 for j in 0..tile.size[0] {
                     if needs.extremes {
-                        extremes.row(level, job, z - z0, j);
+                        extremes.row(level, job, &tile, z - z0, j);
                     }
                     if let Some(sums) = &mut sums {
                         if j.is_multiple_of(BLOCK) {
@@ -197,12 +211,12 @@ fn corners(job: &Job) -> impl Iterator<Item = (usize, usize)> + '_ {
 
 /// The last `kept` rows of the buffer of the tile above, in the plane at `plane`; they become the first of this tile's.
 fn made_above(job: &Job, kept: usize, plane: usize) -> Range<usize> {
-    plane + job.tile[0] * job.pitch..plane + (job.tile[0] + kept) * job.pitch
+    plane + job.tile[0] * job.narrow..plane + (job.tile[0] + kept) * job.narrow
 }
 
 /// Rows after the kept ones that do not exist, as elements of the plane at `plane`.
 fn empty_rows(job: &Job, tile: &Tile, kept: usize, plane: usize) -> impl Iterator<Item = Range<usize>> {
-    let pitch = job.pitch;
+    let pitch = job.narrow;
     let rows = [kept..tile.rows.0, tile.rows.1.max(kept)..job.height];
     rows.into_iter().filter(|r| r.start < r.end).map(move |r| plane + r.start * pitch..plane + r.end * pitch)
 }
@@ -274,9 +288,9 @@ impl<'a, T: Float> Extremes<'a, T> {
     fn lens(job: &Job) -> [usize; 5] {
         let k = job.needs.extremes as usize;
         [
-            job.batch * job.plane(),
+            job.batch * job.narrow_plane(),
             job.rows * job.pitch + SLACK,
-            2 * job.pitch,
+            2 * (job.pitch + SLACK),
             deep_len(job),
             job.tile[1].next_multiple_of(64),
         ]
@@ -298,13 +312,15 @@ impl<'a, T: Float> Extremes<'a, T> {
 
     /// Nothing is neutral.
     fn clear(&mut self) {
-        self.lo.fill(T::GREATEST);
-        self.hi.fill(T::LEAST);
+        for (lo, hi) in [(&mut self.lo, &mut self.hi), (&mut self.row_lo, &mut self.row_hi)] {
+            lo.fill(T::GREATEST);
+            hi.fill(T::LEAST);
+        }
     }
 
     /// Moves rows that the tile above has made; rows that do not exist are neutral.
     fn keep(&mut self, job: &Job, tile: &Tile, kept: usize) {
-        for plane in (0..self.lo.len()).step_by(job.plane()) {
+        for plane in (0..self.lo.len()).step_by(job.narrow_plane()) {
             let above = made_above(job, kept, plane);
             self.lo.copy_within(above.clone(), plane);
             self.hi.copy_within(above, plane);
@@ -322,20 +338,20 @@ impl<'a, T: Float> Extremes<'a, T> {
         }
         let plain = Coding { flip: T::default(), missing: T::default() };
         let (masked, sources, blocks) = (Masked::<false>, Sources::<false>, (job.batch, job.block));
-        let (cols, out) = (tile.cols.1 - tile.cols.0, (tile.span(job, j).start, job.plane()));
+        let (cols, out) = (tile.columns(), (j * job.narrow, job.narrow_plane()));
         let clip = (lines.exist.0 as isize, lines.exist.1 as isize);
-        let from = lines::Lines { base: tile.cols.0, pitch: lines.pitch, first: 0, clip };
+        let from = lines::Lines { base: tile.cols.0 - first(tile), pitch: lines.pitch, first: 0, clip };
         let (src, w) = ([&*lines.buffer; 2], job.window[0]);
         blocked(level, blocks, masked, sources, src, from, w, cols, plain, self.lo, self.hi, out, self.deep);
     }
 
     /// Over y and x, row `j` of plane `k`; rows come in order.
-    fn row(&mut self, level: Level, job: &Job, k: usize, j: usize) {
+    fn row(&mut self, level: Level, job: &Job, tile: &Tile, k: usize, j: usize) {
         if j.is_multiple_of(job.rows) {
-            let plane = k * job.plane()..(k + 1) * job.plane();
-            let plain = Coding { flip: T::default(), missing: T::default() };
+            let plane = k * job.narrow_plane()..(k + 1) * job.narrow_plane();
             let from = [&self.lo[plane.clone()], &self.hi[plane]];
-            rows_extremes(level, job, from, j, plain, self.row_lo, self.row_hi, self.deep);
+            let lines = lines::Lines { base: 0, pitch: job.narrow, first: j as isize, clip: (0, job.height as isize) };
+            rows_extremes(level, job, tile, from, lines, self.row_lo, self.row_hi, self.deep);
         }
         let line = (j % job.rows) * job.pitch;
         let (lo, hi) = (&self.row_lo[line..], &self.row_hi[line..]);
@@ -369,7 +385,7 @@ impl<'a, A: Sum> Buffers<'a, A> {
         let outputs = Self::outputs(job);
         let groups = (0..3).map(|a| moments::groups_len(job.window[a], outputs[a] / BLOCK)).max().unwrap_or(0);
         let width = width(job);
-        [job.batch * job.plane(), job.tile[0] * width, BLOCK * job.tile[1], groups]
+        [job.batch * job.narrow_plane(), job.tile[0] * width, BLOCK * job.tile[1], groups]
     }
 
     fn bytes(job: &Job, wanted: Wanted) -> usize {
@@ -413,7 +429,7 @@ impl<'a, A: Sum> Buffers<'a, A> {
             }
         }
         self.aim(job, 1, tile.y);
-        for plane in (0..self.planes.s.len()).step_by(job.plane()) {
+        for plane in (0..self.planes.s.len()).step_by(job.narrow_plane()) {
             self.planes.copy_within(made_above(job, kept, plane), plane);
             for gap in empty_rows(job, tile, kept, plane) {
                 self.planes.part(gap).clear();
@@ -428,6 +444,7 @@ impl<'a, A: Sum> Buffers<'a, A> {
         level: Level,
         wanted: Wanted,
         job: &Job,
+        tile: &Tile,
         z0: usize,
         j: usize,
         lines: &Lines<T>,
@@ -437,13 +454,13 @@ impl<'a, A: Sum> Buffers<'a, A> {
             pitch: lines.pitch,
             window: job.window[0],
             blocks: 0..job.batch.min(job.dst[0] - z0).div_ceil(BLOCK),
-            columns: width(job),
+            columns: existing(tile),
             weights: &self.weights[0],
             counts: &*self.counts[0],
-            layout: Layout { block: BLOCK * job.plane(), column: 1, output: job.plane() },
+            layout: Layout { block: BLOCK * job.narrow_plane(), column: 1, output: job.narrow_plane() },
         };
         let end = self.planes.s.len();
-        let out = &mut self.planes.part(j * job.pitch..end);
+        let out = &mut self.planes.part(j * job.narrow..end);
         T::pass(level, wanted, lines.buffer, &pass, &mut self.groups, out);
     }
 
@@ -451,16 +468,18 @@ impl<'a, A: Sum> Buffers<'a, A> {
     fn rows(&mut self, level: Level, wanted: Wanted, job: &Job, tile: &Tile, k: usize) {
         let width = width(job);
         let pass = Pass {
-            lines: self.planes.held().tail(k * job.plane()),
-            pitch: job.pitch,
+            lines: self.planes.held().tail(k * job.narrow_plane()),
+            pitch: job.narrow,
             window: job.window[1],
             blocks: 0..tile.size[0].div_ceil(BLOCK),
-            columns: width,
+            columns: existing(tile),
             weights: &self.weights[1],
             counts: &*self.counts[1],
             layout: Layout { block: BLOCK * width, column: LANES, output: LANES },
         };
-        moments::pass_turned(level, wanted, &pass, &mut self.groups, &mut self.columns);
+        let end = self.columns.s.len();
+        let out = &mut self.columns.part(first(tile) * LANES..end);
+        moments::pass_turned(level, wanted, &pass, &mut self.groups, out);
     }
 
     /// Over x, the eight rows of block `b`.

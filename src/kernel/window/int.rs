@@ -7,9 +7,10 @@
 use super::along::SLACK;
 use super::emit::{Emit, IntRows};
 use super::estimate::{self, Acc, Code, RowSum, Width};
-use super::extremes::{blocked, deep_len, rows_extremes};
+use super::extremes::{Groups, blocked, deep, deep_extremes, deep_len, rows_extremes, slots};
 use super::lines::{self, Add, Coding, Masked, Op, Pitches, Sources};
 use super::plan::{Job, Plain, ROWS, Stage, Tile, bits, cut, padded};
+use super::slide::{Rows, Slide};
 use crate::grid::View;
 use crate::kernel::simd::Level;
 
@@ -154,10 +155,13 @@ fn buffer_bytes<T: Plain, Z1: Plain, Y1: Plain, X1: Plain, Z2: Plain, Y2: Plain,
     masked: bool,
 ) -> usize {
     let k = job.needs.extremes as usize;
-    let planes = 2 * padded::<T>(job.batch * job.plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
+    let planes = 2 * padded::<T>(job.batch * job.narrow_plane()) + 2 * padded::<T>(job.rows * job.pitch + SLACK);
     let stage = padded::<T>(Stage::len(job, size_of::<T>()));
-    let rows =
-        stage + padded::<T>(2 * job.pitch) + padded::<T>(deep_len(job)) + 2 * padded::<T>(ROWS * job.out_pitch());
+    let rows = stage
+        + padded::<T>(kept_len(job))
+        + padded::<T>(2 * (job.pitch + SLACK))
+        + padded::<T>(deep_len(job))
+        + 2 * padded::<T>(ROWS * job.out_pitch());
     k * (planes + rows)
         + Moment::<Z1, Y1, X1>::bytes(job, job.needs.mean)
         + Moment::<Z2, Y2, X2>::bytes(job, job.needs.variance)
@@ -299,7 +303,7 @@ fn widen_inner<Y: Acc, X: Acc + From<Y>>(from: &[Y], to: &mut [X]) {
     }
 }
 
-impl<Z: Acc, Y: Acc + Plain + From<Z>, X: Acc + Plain + From<Y>> Moment<'_, Z, Y, X>
+impl<Z: Acc, Y: Acc + Plain + From<Z>, X: Acc + Plain + From<Y> + Slide<Z, Y>> Moment<'_, Z, Y, X>
 where
     Add: Op<X>,
 {
@@ -315,6 +319,11 @@ where
     /// Sums of the windows of `rows` output rows from `y` of the tile on, left in `out`.
     fn finish_rows(&mut self, level: Level, job: &Job, y: usize, rows: usize) {
         let (w, n, pitch) = (job.window[2], job.tile[1], job.pitch);
+        let lines = Rows { plane: self.plane, pitch, first: y, rows, window: job.window[1] };
+        let run = &mut self.rows[..pitch];
+        if X::windows(level, lines, run, w, n, self.out, job.out_pitch(), self.work) {
+            return;
+        }
         slide_rows(level, self.plane, y, job.window[1], pitch, job.columns(), rows, self.rows);
         let made = &self.rows[pitch..][..rows * pitch];
         let from = if self.wide.is_empty() {
@@ -323,12 +332,9 @@ where
             widen(level, made, self.wide);
             &*self.wide
         };
-        let pitches = Pitches { from: pitch, to: job.out_pitch(), rows };
-        if !X::windows(level, from, w, n, self.out, pitches, self.work) {
-            for k in 0..rows {
-                let to = &mut self.out[k * pitches.to..][..n];
-                lines::tree_sum(level, &from[k * pitch..][..pitch], w, 1, to, self.work);
-            }
+        for k in 0..rows {
+            let to = &mut self.out[k * job.out_pitch()..][..n];
+            lines::tree_sum(level, &from[k * pitch..][..pitch], w, 1, to, self.work);
         }
         self.rows.copy_within(rows * pitch..(rows + 1) * pitch, 0);
     }
@@ -382,22 +388,23 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     T: Code + Plain,
     Z1: Acc + Plain + From<T>,
     Y1: Acc + Plain + From<Z1>,
-    X1: RowSum + Plain + From<Y1>,
+    X1: RowSum + Plain + From<Y1> + Slide<Z1, Y1>,
     Z2: Acc + Plain + From<T::Square>,
     Y2: Acc + Plain + From<Z2>,
-    X2: Acc + Plain + From<Y2>,
+    X2: Acc + Plain + From<Y2> + Slide<Z2, Y2>,
     Add: Op<X1> + Op<X2>,
 {
     let Setup { job, level, flip, missing } = *setup;
     let needs = job.needs;
     let bytes = &mut scratch;
     let k = needs.extremes as usize;
-    let lo = cut::<T>(bytes, k * job.batch * job.plane());
-    let hi = cut::<T>(bytes, k * job.batch * job.plane());
+    let lo = cut::<T>(bytes, k * job.batch * job.narrow_plane());
+    let hi = cut::<T>(bytes, k * job.batch * job.narrow_plane());
     let row_lo = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
     let row_hi = cut::<T>(bytes, k * (job.rows * job.pitch + SLACK));
-    let work = cut::<T>(bytes, k * 2 * job.pitch);
+    let work = cut::<T>(bytes, k * 2 * (job.pitch + SLACK));
     let deep = cut::<T>(bytes, k * deep_len(job));
+    let kept = cut::<T>(bytes, k * kept_len(job));
     let out_lo = cut::<T>(bytes, k * ROWS * job.out_pitch());
     let out_hi = cut::<T>(bytes, k * ROWS * job.out_pitch());
     let stage = cut::<T>(bytes, k * Stage::len(job, size_of::<T>()));
@@ -408,14 +415,17 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     let [n, inverse] = [(); 2].map(|()| ROWS * job.out_pitch());
     let mut counts = Counts { columns, n: cut(bytes, n), inverse: cut(bytes, inverse), made: [0; ROWS] };
     let coding = Coding { flip, missing: missing.unwrap_or_default() };
-    let plain = Coding { flip: T::default(), missing: T::default() };
     let (most, divides) = (job.counts().0, emit.divides());
     let width = Width::of(most, T::TOP);
     for tile in Tile::all(job) {
         let (y, x) = (tile.y, tile.x);
         counts.begin_tile(job, &tile);
-        lo.fill(T::GREATEST);
-        hi.fill(T::LEAST);
+        if tile.columns() < T::CHUNK.as_ref().len() {
+            lo.fill(T::GREATEST);
+            hi.fill(T::LEAST);
+        }
+        row_lo.fill(T::GREATEST);
+        row_hi.fill(T::LEAST);
         s1.plane.fill(Z1::default());
         s2.plane.fill(Z2::default());
         count.plane.fill(0);
@@ -450,7 +460,7 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
         }
         for z0 in (0..job.dst[0]).step_by(job.batch) {
             if needs.extremes {
-                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, deep, stage);
+                planes_extremes::<T, M>(level, job, &tile, src, z0, coding, lo, hi, kept, stage);
             }
             for z in z0..(z0 + job.batch).min(job.dst[0]) {
                 let new = Some(first + z + reach).filter(|z| *z < job.src[0]);
@@ -466,13 +476,14 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
                 if M {
                     count.begin_rows(level, job);
                 }
-                let plane = (z - z0) * job.plane();
+                let plane = (z - z0) * job.narrow_plane()..(z - z0 + 1) * job.narrow_plane();
                 for j in (0..tile.size[0]).step_by(ROWS) {
                     let rows = ROWS.min(tile.size[0] - j);
                     if needs.extremes {
                         if j % job.rows == 0 {
-                            let from = [&lo[plane..plane + job.plane()], &hi[plane..plane + job.plane()]];
-                            rows_extremes(level, job, from, j, plain, row_lo, row_hi, deep);
+                            let from = [&lo[plane.clone()], &hi[plane.clone()]];
+                            let lines = tile.lines(job, j);
+                            rows_extremes(level, job, &tile, from, lines, row_lo, row_hi, deep);
                         }
                         let line = (j % job.rows) * job.pitch;
                         let (w, n) = (job.window[2], job.tile[1]);
@@ -520,7 +531,13 @@ fn run<T, Z1, Y1, X1, Z2, Y2, X2, const M: bool>(
     }
 }
 
-/// Extremes over z of a batch of output planes, straight from `src`.
+/// Elements of the extremes of groups of planes that a tile keeps from batch to batch.
+fn kept_len(job: &Job) -> usize {
+    2 * slots(job.window[0], job.batch / 8) * job.narrow_plane()
+}
+
+/// Extremes over z of a batch of output planes, straight from `src`. Long windows are made of groups of planes, which stay in
+/// `kept`.
 #[allow(clippy::too_many_arguments)]
 fn planes_extremes<T: Code + Plain, const M: bool>(
     level: Level,
@@ -531,28 +548,27 @@ fn planes_extremes<T: Code + Plain, const M: bool>(
     coding: Coding<T>,
     lo: &mut [T],
     hi: &mut [T],
-    work: &mut [T],
+    kept: &mut [T],
     buffer: &mut [T],
 ) {
-    let cols = tile.cols.1 - tile.cols.0;
+    let (cols, w, plane) = (tile.columns(), job.window[0], job.narrow_plane());
+    let (masked, sources) = (Masked::<M>, Sources::<false>);
     let stage = Stage::new(job, size_of::<T>(), z0);
     for j in tile.rows.0..tile.rows.1 {
+        let at = (j - tile.rows.0) * job.narrow;
+        if deep(w, cols, job.block, T::CHUNK.as_ref().len()) {
+            let lines = tile.column(job, src, j);
+            let blocks = (z0 / 8, (z0 + job.batch) / 8);
+            // Those of the batch before are there.
+            let from = if z0 == 0 { 1 } else { z0 / 8 + (w - 8) / 8 };
+            let groups = Groups { at, stride: plane, slots: slots(w, job.batch / 8), from };
+            let (src, out) = ([src.data; 2], (at, plane));
+            deep_extremes(level, masked, sources, src, lines, w, cols, coding, blocks, lo, hi, out, groups, kept);
+            continue;
+        }
         let (from, lines) = stage.fill(tile, src, j, buffer);
-        let out = (tile.span(job, j).start, job.plane());
-        blocked(
-            level,
-            (job.batch, job.block),
-            Masked::<M>,
-            Sources::<false>,
-            [from; 2],
-            lines,
-            job.window[0],
-            cols,
-            coding,
-            lo,
-            hi,
-            out,
-            work,
-        );
+        let blocks = (job.batch, job.block);
+        let out = (at, plane);
+        blocked(level, blocks, masked, sources, [from; 2], lines, w, cols, coding, lo, hi, out, kept);
     }
 }

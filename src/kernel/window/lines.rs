@@ -236,7 +236,7 @@ pub fn row_extremes<E: Elem>(
     pitches: Pitches,
     work: &mut [E],
 ) {
-    if !E::windows(level, lo, hi, w, n, out_lo, out_hi, pitches) {
+    if !E::windows(level, lo, hi, w, n, out_lo, out_hi, pitches, work) {
         for k in 0..pitches.rows {
             let (from, to) = (k * pitches.from, k * pitches.to);
             tree_extreme(level, Lo, &lo[from..][..n + w - 1], w, 1, &mut out_lo[to..][..n], work);

@@ -31,6 +31,7 @@ mod parts;
 mod plan;
 #[doc(hidden)]
 pub mod reference;
+mod slide;
 #[cfg(test)]
 mod tests;
 

@@ -71,6 +71,8 @@ pub struct Job {
     pub row_block: usize,
     /// Elements from row to row of tile buffers.
     pub pitch: usize,
+    /// The same where only columns that exist are kept.
+    pub narrow: usize,
     /// Rows of tile buffers.
     pub height: usize,
 }
@@ -86,18 +88,20 @@ impl Job {
         }
         let width = even(dst[2], MAX_WIDTH);
         let pitch = odd_lines(width + 2 * radius[2]);
+        let narrow = odd_lines((width + 2 * radius[2]).min(src[2]));
         let planes = block(window[0], dst[0]);
-        // Each batch makes the groups of extremes anew, so long windows want deep batches.
+        // Each batch reads the groups of extremes anew, so long windows want deep batches.
         let deep = if window[0] < DEEP { 1 } else { 4 };
         let batch = planes * deep.min(dst[0].div_ceil(planes));
-        let rows =
-            (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(2 * radius[1]).max(MIN_ROWS);
+        let rows = (TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]);
+        let tall = if window[1] < DEEP { 2 } else { TALL };
+        let rows = rows.max(MIN_ROWS).max((tall * radius[1]).min(MOST_TALL)).max(2 * radius[1]);
         let tile = [even(dst[1], rows).next_multiple_of(ROWS).min(dst[1]), width];
         let height = tile[0] + 2 * radius[1];
         let row_block = block(window[1], tile[0]);
-        let rows = if window[1] < DEEP { ROWS } else { row_block * 4.min(tile[0].div_ceil(row_block)) };
-        let skip = [0; 3];
-        Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+        let rows = if window[1] < DEEP { ROWS } else { row_block * LONG_ROWS.min(tile[0].div_ceil(row_block)) };
+        let (skip, block) = ([0; 3], planes);
+        Job { src, dst, at, skip, radius, window, needs, tile, batch, block, rows, row_block, pitch, narrow, height }
     }
 
     /// Float windows come in blocks of eight that start at multiples of eight of the volume, and so do tiles and batches.
@@ -105,17 +109,20 @@ impl Job {
     fn blocks(src: Shape, dst: Shape, radius: [usize; 3], needs: Needs, moments: usize) -> Job {
         let window = radius.map(|r| 2 * r + 1);
         let most = dst.map(|n| (n + BLOCK - 1).next_multiple_of(BLOCK));
-        let width = most[2].min(FLOAT_WIDTH);
+        let tiles = dst[2].div_ceil(MAX_WIDTH).max(1);
+        let width = (dst[2] + BLOCK - 1).div_ceil(tiles).next_multiple_of(BLOCK);
         let pitch = odd_lines(width + 2 * radius[2]);
+        // Vectors start at multiples of eight of the tile.
+        let narrow = odd_lines((width + 2 * radius[2]).min(src[2] + 2 * (BLOCK - 1)));
         // Groups along z are made anew by each batch.
         let batch = most[0].min(BLOCK * if window[0] < DEEP { 1 } else { 4 });
-        let rows = (FLOAT_TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(MIN_ROWS);
+        let rows = (FLOAT_TILE_BYTES / (pitch * moments * batch)).saturating_sub(2 * radius[1]).max(FLOAT_MIN_ROWS);
         let tile = [most[1].min(rows.max(2 * radius[1]).next_multiple_of(BLOCK)), width];
         let height = tile[0] + 2 * radius[1];
         let (planes, row_block) = (block(window[0], batch), block(window[1], tile[0]));
-        let rows = row_block * if window[1] < DEEP { 1 } else { 4.min(tile[0].div_ceil(row_block)) };
-        let (at, skip) = ([0; 3], [0; 3]);
-        Job { src, dst, at, skip, radius, window, needs, tile, batch, block: planes, rows, row_block, pitch, height }
+        let rows = row_block * if window[1] < DEEP { 1 } else { LONG_ROWS.min(tile[0].div_ceil(row_block)) };
+        let (at, skip, block) = ([0; 3], [0; 3], planes);
+        Job { src, dst, at, skip, radius, window, needs, tile, batch, block, rows, row_block, pitch, narrow, height }
     }
 
     /// Starts `phase` outputs earlier.
@@ -158,17 +165,33 @@ impl Job {
     pub fn plane(&self) -> usize {
         self.height * self.pitch
     }
+
+    /// Elements of a plane of extremes: columns that exist, and of integers only the rows that do.
+    pub fn narrow_plane(&self) -> usize {
+        self.narrow * if self.needs.float { self.height } else { self.height.min(self.src[1]) }
+    }
 }
 
 /// Output rows of integers that go through x and the estimators together, so that few calls are made: a multiple of every
 /// block.
 pub const ROWS: usize = 8;
-/// Widest tile in x.
-const MAX_WIDTH: usize = 512;
-/// The same for floats, whose planes hold sums of 8 and 16 bytes.
-const FLOAT_WIDTH: usize = 256;
-/// Fewest rows of a tile (if there are as many).
-const MIN_ROWS: usize = 32;
+/// Blocks of rows whose extremes along y are made together where windows are long: their planes come from far, and groups of
+/// rows are read once. 2-core Zen 4 VM, AVX-512, 2026-11-27, min and max of u16, r=64, 256 x 256 planes: 5.8 ns per voxel with
+/// 4 blocks, planes with columns that do not exist and trees along x; 3.6 with 16, planes without and doubling along x.
+const LONG_ROWS: usize = 16;
+/// Widest tile in x. 2-core Zen 4 VM, AVX-512, 2026-11-27, planes of 640 x 640, ns per voxel with two tiles of 320 and one of
+/// 640: r=10, variance u16 2.82, 1.95; four moments u8 3.51, 2.53; cdf_power u16 2.33, 2.10; r=64, cdf_power u16 7.1, 4.6.
+/// Floats with three tiles of 256 and one: variance f32, r=10, 7.9, 6.7; cdf_power f32, r=64, 17.9, 11.5.
+const MAX_WIDTH: usize = 768;
+/// Fewest rows of a tile (if there are as many). Planes of 640 x 640, cdf_power u16, r=10 as above: 2.10 with 38, 2.04 with 64.
+const MIN_ROWS: usize = 64;
+/// The same for floats, whose tiles keep the rows of the tile above.
+const FLOAT_MIN_ROWS: usize = 32;
+/// Rows of a tile in radii where windows are long, for at most so many rows: its halo of two radii goes through z as well.
+/// 2-core Zen 4 VM, AVX-512, 2026-11-27, r=64, u16, ns per voxel with 2 and 4 radii: min and max of 256 x 256 planes 2.96, 2.66;
+/// cdf_power of 640 x 640 planes 5.3, 4.6.
+const TALL: usize = 4;
+const MOST_TALL: usize = 256;
 /// Bytes of batch planes to aim at. They share a 1 MiB L2 with the raw planes, but low tiles make many rows twice, and what
 /// spills is read in order. 2-core Zen 4 VM, AVX-512, 2026-11-27, r=10, ns/voxel with 640 KiB, 1280 KiB and 2 MiB:
 /// cdf_power u16 2.11, 1.98, 1.99; chebyshev u16 1.99, 1.84, 1.87; four moments u8 2.65, 2.50, 2.57.
@@ -281,6 +304,24 @@ impl Tile {
     pub fn all(job: &Job) -> impl Iterator<Item = Tile> + '_ {
         let ys = (0..job.dst[1]).step_by(job.tile[0]);
         ys.flat_map(move |y| (0..job.dst[2]).step_by(job.tile[1]).map(move |x| Tile::new(job, y, x)))
+    }
+
+    /// Columns that exist.
+    pub fn columns(&self) -> usize {
+        self.cols.1 - self.cols.0
+    }
+
+    /// Lines of windows along y from output row `j` of the tile on, in a plane of the rows and columns that exist.
+    pub fn lines(&self, job: &Job, j: usize) -> Lines {
+        let clip = (0, (self.rows.1 - self.rows.0) as isize);
+        Lines { base: 0, pitch: job.narrow, first: j as isize - self.rows.0 as isize, clip }
+    }
+
+    /// Lines of windows along z from the first output on, at buffer row `j`.
+    pub fn column<T>(&self, job: &Job, src: View<T>, j: usize) -> Lines {
+        let base = (self.rows.2 + j - self.rows.0) * src.row + self.cols.2;
+        let first = job.at[0] - job.radius[0] as isize;
+        Lines { base, pitch: src.plane, first, clip: (0, src.shape[0] as isize) }
     }
 
     /// Part of buffer row `j` that `src` covers, as element indices of a plane.

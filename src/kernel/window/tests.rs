@@ -279,8 +279,25 @@ fn wide_sums_of_long_windows() {
 }
 
 #[test]
+fn long_windows_in_many_batches_and_tiles() {
+    // Groups of lines are kept from batch to batch along z (of 32 planes) and made anew per tile (of 68 rows) along y.
+    let shape = [75, 80, 90];
+    for (dtype, missing) in [(DType::U8, None), (DType::I16, Some(77)), (DType::U32, None), (DType::F32, None)] {
+        let mut next = random(47);
+        let volume = make(dtype, shape, |i| ((next() >> 40) % 120 + (i / 9000) as u64) as f64);
+        for radius in [[16, 17, 40], [37, 16, 3], [2, 31, 70]] {
+            let mut p = params(radius);
+            p.missing = missing;
+            check("long", &volume, shape, &p, 53_003);
+            check_bricks(&volume, shape, &p, [43, 80, 90]);
+            check_bricks(&volume, shape, &p, [75, 37, 61]);
+        }
+    }
+}
+
+#[test]
 fn long_float_windows_in_short_last_tiles() {
-    let shape = [3, 9, 530]; // three tiles along x, the last of 18 voxels
+    let shape = [3, 9, 771]; // two tiles along x, the last of 379 voxels
     for dtype in [DType::F32, DType::F64] {
         check("short tile", &noisy(dtype, shape, 43), shape, &params([1, 2, 64]), 401);
     }
