@@ -38,7 +38,7 @@ const PAGE: Page = Page {
 /// The value of a pixel: runs and noise, so that codes of all lengths come.
 fn value(dtype: DType, y: usize, x: usize) -> f64 {
     let noise = ((y * 7919 + x * 104_729) as u32).wrapping_mul(2_654_435_761) >> 8;
-    let v = if (x / 5 + y / 3) % 3 == 0 { 17 } else { noise % 60_000 };
+    let v = if (x / 5 + y / 3).is_multiple_of(3) { 17 } else { noise % 60_000 };
     match dtype {
         DType::U8 => (v % 256) as f64,
         DType::U16 => v as f64,
