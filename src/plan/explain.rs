@@ -5,6 +5,7 @@ use std::fmt::Write;
 use serde_json::{Value, json};
 
 use super::brick::mib;
+use super::decodes;
 use super::graph::{Producer, Step, StepId};
 use super::skips::{self, Known};
 use super::tasks::input_halo;
@@ -17,10 +18,17 @@ use crate::store::{Source, open_inputs};
 
 /// Opens the inputs' headers, plans, and describes the plan for people and for programs. Runs nothing.
 pub fn explain(config: &Config) -> Result<(String, Value)> {
-    let sources = open_inputs(config)?;
-    let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
-    let mut gpu = None;
-    let plan = Plan::new(config, &infos, &mut || crate::gpu::find(config.run.device, &mut gpu))?;
+    let mut sources = open_inputs(config)?;
+    let plan_of = |sources: &[Source]| {
+        let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
+        let mut gpu = None;
+        Plan::new(config, &infos, &mut || crate::gpu::find(config.run.device, &mut gpu))
+    };
+    let mut plan = plan_of(&sources)?;
+    while let Some(input) = decodes::worth_unpacking(&plan) {
+        sources[input].unpack_first();
+        plan = plan_of(&sources)?;
+    }
     let skips = plan.groups.iter().map(|g| skips::known(&plan, g, &sources)).collect::<Result<Vec<_>>>()?;
     Ok((text(config, &plan, &sources, &skips), describe(config, &plan, &sources, &skips)))
 }

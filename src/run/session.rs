@@ -25,7 +25,7 @@ use crate::brick::{Pool, Scratch};
 use crate::config::{Config, Device, config_hash};
 use crate::gpu::{self, Gpu};
 use crate::grid::{Region, order::morton};
-use crate::plan::{BrickChoice, Group, Plan};
+use crate::plan::{BrickChoice, Group, Plan, decodes};
 use crate::store::sink::{Claim, Sink};
 use crate::store::{Source, VolumeInfo, open_inputs};
 use crate::{Error, Result};
@@ -73,15 +73,19 @@ impl<'a> Session<'a> {
     /// its order.
     pub fn open_with(
         config: &'a Config,
-        sources: Vec<Source>,
+        mut sources: Vec<Source>,
         options: &'a RunOptions,
         progress: &'a dyn Progress,
     ) -> Result<Session<'a>> {
         if sources.len() != config.inputs.len() {
             return Err(Error::Failed(format!("{} sources for {} inputs", sources.len(), config.inputs.len())));
         }
-        let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
-        let (plan, gpu) = plan_and_gpu(config, &infos, options.resume)?;
+        let (mut infos, mut plan, mut gpu) = plan_and_gpu(config, &sources, options.resume)?;
+        while let Some(input) = decodes::worth_unpacking(&plan) {
+            sources[input].unpack_first();
+            drop(gpu);
+            (infos, plan, gpu) = plan_and_gpu(config, &sources, options.resume)?;
+        }
         plan.warnings.iter().for_each(|w| progress.note(w));
         plan.gpu_note(config).iter().for_each(|n| progress.note(n));
         let identities = sources.iter().map(Source::identity).collect::<Result<Vec<_>>>()?;
@@ -185,6 +189,7 @@ impl<'a> Session<'a> {
                 }
                 !cancel.is_cancelled()
             })?;
+            self.metrics.bytes_read(source.unpacked_bytes());
         }
         // What was unpacked has no name any more; nothing stays behind, whatever happens.
         if let Some(dir) = self.scratch.take() {
@@ -472,19 +477,20 @@ fn reasons(plan: &Plan) -> Value {
 }
 
 /// Plans, and opens the GPU where a step runs on it. With `auto`, a run that was begun without a GPU goes on without one.
-fn plan_and_gpu(config: &Config, infos: &[VolumeInfo], resume: bool) -> Result<(Plan, Option<Gpu>)> {
+fn plan_and_gpu(config: &Config, sources: &[Source], resume: bool) -> Result<(Vec<VolumeInfo>, Plan, Option<Gpu>)> {
+    let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
     let mut opened = None;
-    let plan = Plan::new(config, infos, &mut || gpu::find(config.run.device, &mut opened))?;
-    let Some(facts) = &plan.gpu else { return Ok((plan, None)) };
+    let plan = Plan::new(config, &infos, &mut || gpu::find(config.run.device, &mut opened))?;
+    let Some(facts) = &plan.gpu else { return Ok((infos, plan, None)) };
     let earlier = if resume { Journal::read(&outputs::journal_dir(&plan)) } else { None };
     if config.run.device == Device::Auto && earlier.is_some_and(|e| e.header["placement"] != json!(plan.held)) {
-        let without = Plan::new(config, infos, &mut || Err("the run was begun without one".into()))?;
-        return Ok((without, None));
+        let without = Plan::new(config, &infos, &mut || Err("the run was begun without one".into()))?;
+        return Ok((infos, without, None));
     }
     if let Some(gpu) = &mut opened {
         gpu.set_cap(facts.buffer_cap(plan.memory));
     }
-    Ok((plan, opened))
+    Ok((infos, plan, opened))
 }
 
 impl Drop for Session<'_> {
