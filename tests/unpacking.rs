@@ -1,4 +1,5 @@
-//! Chunks that the cache cannot hold often enough are unpacked once, others are not; plans say so.
+//! Chunks that the cache cannot hold often enough are unpacked once, others are not; plans say so, and what they say of
+//! memory is what a run can take.
 
 mod common;
 
@@ -61,5 +62,24 @@ fn unpacking_changes_no_voxel() {
         of_stored(dir.path(), WINDOW, memory);
         let decoded = decode(&dir.path().join("o.zarr"));
         assert!(seen.replace(decoded.clone()).is_none_or(|s| s == decoded), "{chunk:?}, {memory}");
+    }
+}
+
+#[test]
+fn a_tiny_volume_is_not_said_to_take_the_whole_budget() {
+    let dir = tempfile::tempdir().unwrap();
+    let peak = |path: &str| {
+        let text = format!(
+            "[run]\nmemory = '2GiB'\nthreads = 2\ndevice = 'cpu'\n[input.v]\npath = '{path}'\n[stage.s]\nop = 'box'\n\
+             input = 'v'\nradius = 3\n[output.o]\npath = 'o.zarr'\nfrom = 's.mean'\n"
+        );
+        let (said, json) = plan::explain(&parse(dir.path(), &text, &[])).unwrap();
+        (json["peak_memory_bytes"].as_u64().unwrap(), said)
+    };
+    write_npy(&dir.path().join("v.npy"), "|u1", [16, 16, 16], &[7; 4096]);
+    run(dir.path(), "[input.v]\npath = 'v.npy'\n[output.o]\npath = 'v.zarr'\nfrom = 'v'\n", &[]);
+    for path in ["v.npy", "v.zarr"] {
+        let (bytes, said) = peak(path);
+        assert!((16 << 20..64 << 20).contains(&bytes), "{bytes} bytes: {said}");
     }
 }

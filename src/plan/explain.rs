@@ -109,12 +109,13 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
     );
     let _ = writeln!(
         w,
-        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {})",
+        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {}, buffers kept for the next brick {})",
         mib(brick.peak(plan.workers)),
         mib(plan.memory),
         mib(brick.alive(plan.workers)),
         mib(brick.cache),
-        mib(brick.parked)
+        mib(brick.parked),
+        mib(brick.waiting)
     );
     let _ = writeln!(w, "  read amplification {:.2}", brick.amplification);
     for step in group.steps.iter().map(|&s| &plan.graph.steps[s]) {
@@ -268,7 +269,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
                 "skippable": skips_json(g, known.as_ref()),
                 "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
                 "brick_bytes": g.brick.bytes, "scratch_bytes": g.brick.scratch, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
-                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache,
+                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache, "waiting_bytes": g.brick.waiting,
                 "peak_memory_bytes": g.brick.peak(plan.workers), "read_amplification": g.brick.amplification,
             })
         })

@@ -357,9 +357,7 @@ impl<'a> Session<'a> {
         tick: &(dyn Fn() + Sync),
     ) -> Result<()> {
         let cache = ChunkCache::new(brick.cache);
-        // Where nothing is cached, what the cache might hold is room for buffers that wait.
-        let cached = if self.infos.iter().any(|i| i.chunk.is_some()) { 0 } else { brick.cache };
-        self.pool.bound((brick.bytes * brick.in_flight as u64 + cached) as usize);
+        self.pool.bound((brick.bytes * brick.in_flight as u64 + brick.waiting) as usize);
         let reader =
             Reader { engine, program, sources: &self.sources, cache: &cache, uses: self.uses(program, work), metrics };
         let stream = Stream {
