@@ -22,6 +22,7 @@ struct Page {
     predictor: u16,
     photometric: u16,
     depth: u32,
+    description: &'static str,
 }
 
 const PAGE: Page = Page {
@@ -33,12 +34,13 @@ const PAGE: Page = Page {
     predictor: 1,
     photometric: 1,
     depth: 1,
+    description: "",
 };
 
 /// The value of a pixel: runs and noise, so that codes of all lengths come.
 fn value(dtype: DType, y: usize, x: usize) -> f64 {
     let noise = ((y * 7919 + x * 104_729) as u32).wrapping_mul(2_654_435_761) >> 8;
-    let v = if (x / 5 + y / 3) % 3 == 0 { 17 } else { noise % 60_000 };
+    let v = if (x / 5 + y / 3).is_multiple_of(3) { 17 } else { noise % 60_000 };
     match dtype {
         DType::U8 => (v % 256) as f64,
         DType::U16 => v as f64,
@@ -152,6 +154,7 @@ fn write(page: &Page, path: &Path) {
         (258, 4, vec![bits]),
         (259, 4, vec![page.compression as u32]),
         (262, 4, vec![page.photometric as u32]),
+        (270, 2, page.description.bytes().map(u32::from).collect()),
         (277, 4, vec![1]),
         (317, 4, vec![page.predictor as u32]),
         (320, 3, map),
@@ -175,7 +178,7 @@ fn write(page: &Page, path: &Path) {
         }
         directory.extend((out.len() as u32).to_le_bytes());
         for v in values {
-            out.extend(&v.to_le_bytes()[..if kind == 3 { 2 } else { 4 }]);
+            out.extend(&v.to_le_bytes()[..[1, 2, 4][kind as usize - 2]]);
         }
     }
     directory.extend([0; 4]);
@@ -227,4 +230,8 @@ fn palettes_and_volumetric_tiles_are_refused_by_name() {
     }
     write(&PAGE, &path);
     Source::open(&file_input(&path)).unwrap();
+    // What ImageJ keeps as a palette is how it shows grey values.
+    write(&Page { photometric: 3, compression: 1, description: "ImageJ=1.53t\n\0", ..PAGE }, &path);
+    let (_, voxels) = whole(&file_input(&path), 0).unwrap();
+    assert!((0..voxels.len()).all(|i| voxels.at(i) == value(DType::U8, i / PAGE.width, i % PAGE.width)));
 }

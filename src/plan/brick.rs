@@ -21,6 +21,8 @@ pub struct BrickChoice {
     pub in_flight: usize,
     /// Bytes for decoded chunks.
     pub cache: u64,
+    /// Bytes for buffers that wait for the next brick, beside what bricks hold; none where there are chunks to hold instead.
+    pub waiting: u64,
     /// Bytes of open chunks of the levels.
     pub parked: u64,
     /// Input voxels read per output voxel.
@@ -31,7 +33,12 @@ pub struct BrickChoice {
 impl BrickChoice {
     /// Worst case by formula.
     pub fn peak(&self, workers: usize) -> u64 {
-        memory::FIXED + memory::PER_THREAD * workers as u64 + self.parked + self.alive(workers) + self.cache
+        memory::FIXED
+            + memory::PER_THREAD * workers as u64
+            + self.parked
+            + self.alive(workers)
+            + self.cache
+            + self.waiting
     }
 
     /// Bytes of all bricks in flight and of the workers' scratch.
@@ -137,14 +144,19 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
     choice.scratch = memory::scratch_bytes(plan, group, shape);
     let fits = |n: &usize| BrickChoice { in_flight: *n, ..choice.clone() }.alive(plan.workers) <= room;
     choice.in_flight = (1..=memory::in_flight(plan.workers)).rev().find(fits)?;
-    choice.cache = memory::cache_bytes(plan, choice.alive(plan.workers), parked);
+    let left = |c: &BrickChoice| memory::left_bytes(plan, c.alive(plan.workers), parked);
+    let decoded = memory::decoded_bytes(plan, group);
+    choice.cache = left(&choice).min(decoded);
     // One brick beyond the workers keeps them busy; more only smooth the flow, and a cache that loses the chunks between two
     // layers of bricks has them decoded again. 2-core Zen 4 VM, 2026-11-26, mean of radius 5, 1024^3 u8 in chunks of 64^3
     // under 256 MiB: 695 MiB of 367 read with 4 bricks in flight, 435 with 3.
     let enough = plan.workers + 1;
     if choice.in_flight > enough && choice.cache < layer_bytes(plan, group) {
         choice.in_flight = enough;
-        choice.cache = memory::cache_bytes(plan, choice.alive(plan.workers), parked);
+        choice.cache = left(&choice).min(decoded);
+    }
+    if decoded == 0 {
+        choice.waiting = left(&choice).min(choice.bytes * choice.in_flight as u64);
     }
     choice.amplification = amplification(plan, group, shape);
     Some(choice)
@@ -166,7 +178,7 @@ fn layer_bytes(plan: &Plan, group: &Group) -> u64 {
         let voxels = layers * across(1) * across(2) * chunk.iter().product::<usize>();
         (voxels * wire.dtype.size() * wire.components) as u64
     };
-    group.inputs.iter().map(one).sum()
+    group.inputs.iter().map(one).sum::<u64>().min(memory::decoded_bytes(plan, group))
 }
 
 /// Relative time of decoding again what bricks leave no room for between two layers of them. Columns of lines are read by

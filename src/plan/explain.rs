@@ -5,6 +5,7 @@ use std::fmt::Write;
 use serde_json::{Value, json};
 
 use super::brick::mib;
+use super::decodes;
 use super::graph::{Producer, Step, StepId};
 use super::skips::{self, Known};
 use super::tasks::input_halo;
@@ -17,10 +18,17 @@ use crate::store::{Source, open_inputs};
 
 /// Opens the inputs' headers, plans, and describes the plan for people and for programs. Runs nothing.
 pub fn explain(config: &Config) -> Result<(String, Value)> {
-    let sources = open_inputs(config)?;
-    let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
-    let mut gpu = None;
-    let plan = Plan::new(config, &infos, &mut || crate::gpu::find(config.run.device, &mut gpu))?;
+    let mut sources = open_inputs(config)?;
+    let plan_of = |sources: &[Source]| {
+        let infos: Vec<_> = sources.iter().map(|s| s.info().clone()).collect();
+        let mut gpu = None;
+        Plan::new(config, &infos, &mut || crate::gpu::find(config.run.device, &mut gpu))
+    };
+    let mut plan = plan_of(&sources)?;
+    while let Some(input) = decodes::worth_unpacking(&plan) {
+        sources[input].unpack_first();
+        plan = plan_of(&sources)?;
+    }
     let skips = plan.groups.iter().map(|g| skips::known(&plan, g, &sources)).collect::<Result<Vec<_>>>()?;
     Ok((text(config, &plan, &sources, &skips), describe(config, &plan, &sources, &skips)))
 }
@@ -101,12 +109,13 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
     );
     let _ = writeln!(
         w,
-        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {})",
+        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {}, buffers kept for the next brick {})",
         mib(brick.peak(plan.workers)),
         mib(plan.memory),
         mib(brick.alive(plan.workers)),
         mib(brick.cache),
-        mib(brick.parked)
+        mib(brick.parked),
+        mib(brick.waiting)
     );
     let _ = writeln!(w, "  read amplification {:.2}", brick.amplification);
     for step in group.steps.iter().map(|&s| &plan.graph.steps[s]) {
@@ -260,7 +269,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
                 "skippable": skips_json(g, known.as_ref()),
                 "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
                 "brick_bytes": g.brick.bytes, "scratch_bytes": g.brick.scratch, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
-                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache,
+                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache, "waiting_bytes": g.brick.waiting,
                 "peak_memory_bytes": g.brick.peak(plan.workers), "read_amplification": g.brick.amplification,
             })
         })

@@ -1,6 +1,6 @@
 //! Bytes by formula: what one brick of a given shape keeps alive at its worst moment, and what the run keeps besides.
 
-use super::graph::{GradientChannel, Moment, Step, StepId, StepKind, WireId};
+use super::graph::{GradientChannel, Moment, Producer, Step, StepId, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan, flows};
 use crate::gpu::flow::Flow;
@@ -302,8 +302,25 @@ pub fn in_flight(threads: usize) -> usize {
     threads + 2
 }
 
-/// Bytes for decoded chunks beside bricks and scratch of `bricks` bytes.
-pub fn cache_bytes(plan: &Plan, bricks: u64, parked: u64) -> u64 {
+/// Bytes that bricks and scratch of `bricks` bytes leave of the budget.
+pub fn left_bytes(plan: &Plan, bricks: u64, parked: u64) -> u64 {
     let fixed = FIXED + PER_THREAD * plan.workers as u64;
     plan.memory.saturating_sub(fixed + parked + bricks)
+}
+
+/// Bytes of all chunks that a group reads, decoded: a cache never holds more. 0 where its inputs have no chunks.
+pub fn decoded_bytes(plan: &Plan, group: &Group) -> u64 {
+    let whole = Region::whole(group.shape);
+    let one = |&w: &WireId| {
+        let wire = &plan.graph.wires[w];
+        let Producer::Input(input) = wire.producer else { return 0 };
+        let Some(chunk) = plan.input_chunks[input] else { return 0 };
+        let streamed = group.steps.iter().any(|&s| plan.graph.steps[s].streamed == Some(w));
+        // Pre-passes and columns of lines see more than the bricks' halos.
+        let all = streamed || !plan.prepasses.is_empty();
+        let seen = if all { whole } else { group.region.grow(input_halo(plan, group, w)).clip(&whole) };
+        let chunks = seen.cells([0; 3], chunk).voxels() as u64;
+        chunks.saturating_mul((chunk.iter().product::<usize>() * wire.components * wire.dtype.size()) as u64)
+    };
+    group.inputs.iter().map(one).fold(0, u64::saturating_add)
 }

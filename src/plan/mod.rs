@@ -2,6 +2,7 @@
 //! indices, printable, without threads, buffers or files.
 
 pub mod brick;
+pub mod decodes;
 pub mod explain;
 mod fills;
 mod fits;

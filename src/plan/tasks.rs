@@ -249,7 +249,7 @@ fn choose_task(outputs: &[&OutputPlan], base: Shape, region: Shape, halo: usize)
         let most: usize = (0..3).map(|a| task[a].min(region[a])).product();
         most * LEAST_TASKS <= region.iter().product()
     };
-    shapes.clone().find(small).or(shapes.last()).unwrap_or(base)
+    shapes.clone().find(small).or(shapes.clone().next_back()).unwrap_or(base)
 }
 
 /// Grows a task from the files of level 0 to those of further levels while it stays near `edge`.

@@ -16,11 +16,13 @@ pub struct Commits {
     waiting: Mutex<(Vec<(usize, Region)>, Instant)>,
 }
 
-impl Commits {
-    pub fn new() -> Commits {
+impl Default for Commits {
+    fn default() -> Commits {
         Commits { waiting: Mutex::new((Vec::new(), Instant::now())) }
     }
+}
 
+impl Commits {
     /// Adds a task; commits all that wait where the last commit is long past.
     pub fn add(
         &self,

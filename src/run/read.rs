@@ -103,7 +103,7 @@ impl Reader<'_> {
             .map(|c| {
                 let (comp, missing) = match &self.uses[input] {
                     Some(uses) => self.chunked(input, c, region, uses, place, why)?,
-                    None => (self.plain(input, c, region)?, false),
+                    None => self.plain(input, c, region)?,
                 };
                 all_missing &= missing;
                 Ok(match comp {
@@ -132,7 +132,7 @@ impl Reader<'_> {
         match &self.uses[input] {
             None => {
                 self.metrics.bytes_read(source.read_again(0, region, dst)?);
-                stored = true;
+                stored = source.absent_box(0, region).is_none();
             }
             Some(uses) => {
                 let shape = source.info().chunk.expect("a chunked source");
@@ -154,12 +154,15 @@ impl Reader<'_> {
         Ok(stored)
     }
 
-    fn plain(&self, input: usize, comp: usize, region: Region) -> Result<Comp> {
+    fn plain(&self, input: usize, comp: usize, region: Region) -> Result<(Comp, bool)> {
         let source = &self.sources[input];
+        if let Some(value) = source.absent_box(comp, region).filter(|_| self.engine.skip) {
+            return Ok((Comp::Const(value), true));
+        }
         let mut voxels = self.engine.pool.take(source.info().dtype, region.voxels());
         let bytes = source.read(comp, region, voxels.view_mut(region.shape()))?;
         self.metrics.bytes_read(bytes);
-        Ok(Comp::Voxels(voxels))
+        Ok((Comp::Voxels(voxels), false))
     }
 
     fn chunked(

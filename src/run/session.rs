@@ -26,7 +26,7 @@ use crate::brick::{Pool, Scratch};
 use crate::config::{Config, config_hash};
 use crate::gpu::Gpu;
 use crate::grid::{Region, order::morton};
-use crate::plan::{BrickChoice, Group, Plan};
+use crate::plan::{BrickChoice, Group, Plan, decodes};
 use crate::store::sink::{Claim, Sink};
 use crate::store::{Source, VolumeInfo, open_inputs};
 use crate::{Error, Result};
@@ -74,15 +74,19 @@ impl<'a> Session<'a> {
     /// its order.
     pub fn open_with(
         config: &'a Config,
-        sources: Vec<Source>,
+        mut sources: Vec<Source>,
         options: &'a RunOptions,
         progress: &'a dyn Progress,
     ) -> Result<Session<'a>> {
         if sources.len() != config.inputs.len() {
             return Err(Error::Failed(format!("{} sources for {} inputs", sources.len(), config.inputs.len())));
         }
-        let infos: Vec<VolumeInfo> = sources.iter().map(|s| s.info().clone()).collect();
-        let (plan, gpu) = planned::plan_and_gpu(config, &infos, options.resume)?;
+        let (mut infos, mut plan, mut gpu) = planned::plan_and_gpu(config, &sources, options.resume)?;
+        while let Some(input) = decodes::worth_unpacking(&plan) {
+            sources[input].unpack_first();
+            drop(gpu);
+            (infos, plan, gpu) = planned::plan_and_gpu(config, &sources, options.resume)?;
+        }
         plan.warnings.iter().for_each(|w| progress.note(w));
         plan.gpu_note(config).iter().for_each(|n| progress.note(n));
         let identities = sources.iter().map(Source::identity).collect::<Result<Vec<_>>>()?;
@@ -186,6 +190,7 @@ impl<'a> Session<'a> {
                 }
                 !cancel.is_cancelled()
             })?;
+            self.metrics.bytes_read(source.unpacked_bytes());
         }
         // What was unpacked has no name any more; nothing stays behind, whatever happens.
         if let Some(dir) = self.scratch.take() {
@@ -272,7 +277,7 @@ impl<'a> Session<'a> {
         let assembler = Assembler { plan: &self.plan, group, targets, pool, level, gpu };
         let deliver =
             |done: &Finished, work: Work, scratch: &mut Scratch| assembler.assemble(done, &slots[work.slot], scratch);
-        let commits = Commits::new();
+        let commits = Commits::default();
         let commit = |tasks: &[(usize, Region)]| self.commit(group, tasks, only.is_none());
         let write = |work: Work, items: Vec<Item>| {
             let slot = &slots[work.slot];
@@ -366,9 +371,7 @@ impl<'a> Session<'a> {
         tick: &(dyn Fn() + Sync),
     ) -> Result<()> {
         let cache = ChunkCache::new(brick.cache);
-        // Where nothing is cached, what the cache might hold is room for buffers that wait.
-        let cached = if self.infos.iter().any(|i| i.chunk.is_some()) { 0 } else { brick.cache };
-        self.pool.bound((brick.bytes * brick.in_flight as u64 + cached) as usize);
+        self.pool.bound((brick.bytes * brick.in_flight as u64 + brick.waiting) as usize);
         let reader =
             Reader { engine, program, sources: &self.sources, cache: &cache, uses: self.uses(program, work), metrics };
         let stream = Stream {

@@ -9,10 +9,11 @@ use std::path::Path;
 
 use super::bytes::{Files, MappedFile};
 use super::lattice::{Lattice, Planes};
+use super::planar::Planar;
 use super::spool::{Progress, nameless};
 use super::zarr::ZarrArray;
 use super::{ChunkRead, VolumeInfo};
-use crate::brick::Voxels;
+use crate::brick::{Voxels, gather};
 use crate::grid::{Region, Shape};
 use crate::store::os::FileExt;
 use crate::{Error, Result};
@@ -25,6 +26,9 @@ const CACHE_SHARE: u64 = 8;
 /// Bytes written at a time: recent kernels keep what one call wrote in one large page, and map all of it into this process
 /// where a byte of it is read.
 const PIECE: usize = 1 << 16;
+
+/// Bytes of chunks side by side that are written together, at most.
+const BAND: usize = 8 << 20;
 
 /// Bytes of all voxels, all components.
 pub fn bytes(info: &VolumeInfo) -> u64 {
@@ -40,8 +44,35 @@ pub fn is_flat(info: &VolumeInfo, memory: u64) -> bool {
     several && one.saturating_mul(4) <= memory && one.saturating_mul(stack) > memory / CACHE_SHARE
 }
 
+/// An array in planes in scratch.
+#[derive(Debug)]
+pub struct Unpacked {
+    pub planes: Planar,
+    /// Bytes that were read from the array.
+    pub read: u64,
+    chunk: Shape,
+    /// Chunks per axis.
+    grid: Shape,
+    /// By component and chunk: nothing is stored, all voxels are `fill`.
+    absent: Vec<bool>,
+    fill: f64,
+}
+
+impl Unpacked {
+    /// The stored value of a box inside the volume in which no chunk was stored.
+    pub fn absent_box(&self, component: usize, region: Region) -> Option<f64> {
+        let absent = |chunk| self.absent[place(self.grid, component, chunk)];
+        region.cells([0; 3], self.chunk).iter().all(absent).then_some(self.fill)
+    }
+}
+
+/// Number of a chunk among those of all components.
+fn place([nz, ny, nx]: Shape, component: usize, [z, y, x]: [i64; 3]) -> usize {
+    ((component * nz + z as usize) * ny + y as usize) * nx + x as usize
+}
+
 /// Decodes every chunk once into a nameless file in `scratch`.
-pub fn run(array: &ZarrArray, info: &VolumeInfo, scratch: &Path, progress: Progress) -> Result<(Lattice, Files)> {
+pub fn run(array: &ZarrArray, info: &VolumeInfo, scratch: &Path, progress: Progress) -> Result<Unpacked> {
     let total = bytes(info);
     let file = nameless(scratch, total)?;
     let failed = |e: std::io::Error| Error::file(scratch, format!("scratch: {e}"));
@@ -54,21 +85,41 @@ pub fn run(array: &ZarrArray, info: &VolumeInfo, scratch: &Path, progress: Progr
     let component = *plane * info.shape[0] as u64;
     *bases = (0..info.components as u64).map(|c| c * component).collect();
     let (chunk, whole) = (array.chunk(), Region::whole(info.shape));
+    let grid: Shape = std::array::from_fn(|a| info.shape[a].div_ceil(chunk[a]));
     let mut voxels = Voxels::zeroed(info.dtype, chunk.iter().product());
-    let mut done = 0;
+    // Chunks side by side are written together: rows of one chunk alone are short, and each would be a call.
+    let beside = (BAND / voxels.as_bytes().len().max(1)).clamp(1, grid[2]);
+    let wide = [chunk[0], chunk[1], chunk[2] * beside];
+    let shape = [chunk[0], chunk[1], wide[2].min(info.shape[2])];
+    let mut band = Voxels::zeroed(info.dtype, if beside > 1 { shape.iter().product() } else { 0 });
+    let (mut done, mut read, mut fill) = (0, 0, 0.0);
+    let mut absent = vec![false; info.components * grid.iter().product::<usize>()];
     for c in 0..info.components {
-        for index in whole.cells([0; 3], chunk).iter() {
-            let cell = Region::of_cell(index, [0; 3], chunk).clip(&whole);
-            let stored = match array.read_chunk(c, index, &mut voxels)? {
-                ChunkRead::Missing(fill) if fill.to_bits() == 0 => false,
-                ChunkRead::Missing(fill) => {
-                    voxels.fill(fill);
-                    true
+        for outer in whole.cells([0; 3], wide).iter() {
+            let cell = Region::of_cell(outer, [0; 3], wide).clip(&whole);
+            let mut stored = false;
+            for index in cell.cells([0; 3], chunk).iter() {
+                match array.read_chunk(c, index, &mut voxels)? {
+                    ChunkRead::Missing(value) => {
+                        fill = value;
+                        voxels.fill(value);
+                        absent[place(grid, c, index)] = true;
+                        stored |= value.to_bits() != 0;
+                    }
+                    ChunkRead::Data { stored_bytes } => {
+                        read += stored_bytes;
+                        stored = true;
+                    }
                 }
-                ChunkRead::Data { .. } => true,
-            };
+                if beside > 1 {
+                    let from = Region::of_cell(index, [0; 3], chunk);
+                    let held = Region::new(cell.lo, std::array::from_fn(|a| cell.lo[a] + shape[a] as i64));
+                    gather::copy_common(voxels.view(chunk), from, band.view_mut(shape), held);
+                }
+            }
             if stored {
-                put(&file, c as u64 * component, info, chunk, cell, voxels.as_bytes()).map_err(failed)?;
+                let (held, shape) = if beside > 1 { (&band, shape) } else { (&voxels, chunk) };
+                put(&file, c as u64 * component, info, shape, cell, held.as_bytes()).map_err(failed)?;
             }
             done += (cell.voxels() * info.dtype.size()) as u64;
             if !progress(done) {
@@ -76,7 +127,8 @@ pub fn run(array: &ZarrArray, info: &VolumeInfo, scratch: &Path, progress: Progr
             }
         }
     }
-    Ok((lattice, Files::Held(vec![MappedFile::of(scratch, file)?])))
+    let planes = Planar::held(lattice, Files::Held(vec![MappedFile::of(scratch, file)?]));
+    Ok(Unpacked { planes, read, chunk, grid, absent, fill })
 }
 
 /// Writes the part of a chunk that lies in the volume, in runs as long as both layouts allow.

@@ -34,6 +34,7 @@ use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, ViewMut, Voxel};
 use crate::kernel::simd::Level;
 use crate::{Error, Result};
 use detect::Format;
+use flat::Unpacked;
 use lattice::Lattice;
 use planar::{Planar, components, key};
 
@@ -44,7 +45,7 @@ pub struct Source {
     kind: Kind,
     level: Level,
     /// Of a Zarr array that is read from scratch: `None` until it is there.
-    flat: Option<Option<Planar>>,
+    flat: Option<Option<Unpacked>>,
 }
 
 #[derive(Debug)]
@@ -111,10 +112,28 @@ impl Source {
     /// Reads a Zarr array by planes from scratch, once prepared, where its chunks are so flat or large that a run of this
     /// budget would decode them again and again. The volume then has no chunks.
     pub fn flatten(&mut self, memory: u64) {
-        if matches!(self.kind, Kind::Zarr(_)) && flat::is_flat(&self.info, memory) {
+        if flat::is_flat(&self.info, memory) {
+            self.unpack_first();
+        }
+    }
+
+    /// Reads a Zarr array by planes from scratch, once prepared. The volume then has no chunks.
+    pub fn unpack_first(&mut self) {
+        if matches!(self.kind, Kind::Zarr(_)) && self.flat.is_none() {
             self.info.chunk = None;
             self.flat = Some(None);
         }
+    }
+
+    /// Bytes that [`Source::prepare`] read from a Zarr array; what is read from scratch then is not counted again.
+    pub fn unpacked_bytes(&self) -> u64 {
+        self.flat.iter().flatten().map(|f| f.read).sum()
+    }
+
+    /// The value of a box inside a volume that was unpacked first, where nothing of it was stored.
+    pub fn absent_box(&self, component: usize, region: Region) -> Option<f64> {
+        let flat = self.flat.as_ref()?.as_ref()?;
+        flat.absent_box(component, region).map(|fill| self.fill(fill))
     }
 
     /// Bytes of scratch disk that [`Source::prepare`] needs (0 for sources that are read in place).
@@ -133,8 +152,7 @@ impl Source {
         match &mut self.kind {
             Kind::Planar(planar) => planar.prepare(scratch, progress),
             Kind::Zarr(array) if matches!(self.flat, Some(None)) => {
-                let (lattice, files) = flat::run(array, &self.info, scratch, progress)?;
-                self.flat = Some(Some(Planar::held(lattice, files)));
+                self.flat = Some(Some(flat::run(array, &self.info, scratch, progress)?));
                 Ok(())
             }
             Kind::Zarr(_) | Kind::Synthetic(_) => Ok(()),
@@ -169,7 +187,10 @@ impl Source {
         let bytes = match &self.kind {
             Kind::Planar(planar) => planar.read(self.level, component, region, reborrow(&mut dst), keep)?,
             Kind::Zarr(array) => match &self.flat {
-                Some(Some(planes)) => planes.read(self.level, component, region, reborrow(&mut dst), keep)?,
+                Some(Some(flat)) => {
+                    flat.planes.read(self.level, component, region, reborrow(&mut dst), keep)?;
+                    0
+                }
                 _ => array.read(component, region, &self.info, reborrow(&mut dst))?,
             },
             Kind::Synthetic(field) => {
@@ -219,7 +240,8 @@ impl Source {
     /// The pages of this box will not be wanted again soon. Acts on boxes of whole z planes of mapped files.
     pub fn release(&self, region: Region) {
         match (&self.kind, &self.flat) {
-            (Kind::Planar(planar), _) | (_, Some(Some(planar))) => planar.release(region),
+            (Kind::Planar(planar), _) => planar.release(region),
+            (_, Some(Some(flat))) => flat.planes.release(region),
             _ => {}
         }
     }

@@ -137,8 +137,8 @@ fn dtype(path: &Path, bits: u64, format: u64) -> Result<DType> {
     })
 }
 
-/// Facts of the page where `decoder` stands; `None` for thumbnails and masks.
-fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize) -> Result<Option<Page>> {
+/// Facts of the page where `decoder` stands; `None` for thumbnails and masks. `display`: a palette says how grey values are shown.
+fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize, display: bool) -> Result<Option<Page>> {
     let fail = |e: tiff::TiffError| broken(path, image, e);
     let mut number =
         |tag: Tag, or: u64| -> Result<u64> { Ok(decoder.find_tag_unsigned::<u64>(tag).map_err(fail)?.unwrap_or(or)) };
@@ -158,12 +158,12 @@ fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize) -> Result<Op
         };
         return Err(refuse(path, &name));
     }
-    if photometric == 3 {
+    if photometric == 3 && !display {
         let text =
             "palette colours (photometric interpretation 3) are not read; accepted are grey values: save it as grey";
         return Err(broken(path, image, text));
     }
-    if !matches!(photometric, 0 | 1) {
+    if !matches!(photometric, 0 | 1 | 3) {
         return Err(broken(
             path,
             image,
@@ -211,7 +211,10 @@ fn pages(path: &Path, file: u32) -> Result<(Vec<Page>, Described)> {
     let text = decoder.find_tag(Tag::ImageDescription).ok().flatten().and_then(|v| v.into_string().ok());
     let mut ratio = |tag: Tag| decoder.find_tag(tag).ok().flatten().and_then(per_unit);
     let resolution = [ratio(Tag::YResolution), ratio(Tag::XResolution)];
-    let described = describe(path, text.as_deref().unwrap_or(""), resolution)?;
+    let text = text.as_deref().unwrap_or("");
+    let described = describe(path, text, resolution)?;
+    // ImageJ keeps the table by which it shows grey values as a palette.
+    let display = text.starts_with("ImageJ=");
     let most = len / LEAST_PAGE;
     let mut pages = Vec::new();
     for image in 0.. {
@@ -224,7 +227,7 @@ fn pages(path: &Path, file: u32) -> Result<(Vec<Page>, Described)> {
         if image as u64 > most {
             return Err(Error::file(path, "the chain of TIFF pages goes in circles"));
         }
-        pages.extend(page(path, &mut decoder, file, image)?);
+        pages.extend(page(path, &mut decoder, file, image, display)?);
     }
     Ok((pages, described))
 }
