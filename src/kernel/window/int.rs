@@ -1,4 +1,4 @@
-//! Integer volumes: exact sums of unsigned codes, running along z and y, by a tree along x.
+//! Integer volumes: exact sums of unsigned codes, running along z and y, running or by a tree along x ([`super::slide`]).
 //!
 //! Widths (n voxels in a window, m in its z-y section, w along z; codes up to T, squares up to T^2): a sum type serves
 //! an axis where the largest final value fits, since wrapped intermediate values cancel. [`run`] is instantiated per
@@ -537,7 +537,9 @@ fn kept_len(job: &Job) -> usize {
 }
 
 /// Extremes over z of a batch of output planes, straight from `src`. Long windows are made of groups of planes, which stay in
-/// `kept`.
+/// `kept`, so that a batch reads no plane but those at the ends of its windows. 2-core Zen 4 VM, AVX-512, 2026-11-27, min and
+/// max of u16, 256 x 256 planes, r=64, ns per voxel with groups made anew: 3.7 in batches of 32 planes, 3.4 of 64; kept: 2.96 of
+/// 32, 3.15 of 16, 3.5 of 8; with lines copied side by side first 3.8 of 64.
 #[allow(clippy::too_many_arguments)]
 fn planes_extremes<T: Code + Plain, const M: bool>(
     level: Level,
