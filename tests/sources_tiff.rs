@@ -16,7 +16,7 @@ struct Page {
     dtype: DType,
     width: usize,
     height: usize,
-    /// Height and width of a tile.
+    /// Height and width of a tile; those of the page: one strip.
     tile: [usize; 2],
     compression: u16,
     predictor: u16,
@@ -136,6 +136,7 @@ fn tile(page: &Page, ty: usize, tx: usize) -> Vec<u8> {
 
 fn write(page: &Page, path: &Path) {
     let [th, tw] = page.tile;
+    let strip = page.tile == [page.height, page.width];
     let (down, across) = (page.height.div_ceil(th), page.width.div_ceil(tw));
     let mut out = b"II\x2a\0\0\0\0\0".to_vec();
     let (mut offsets, mut counts) = (Vec::new(), Vec::new());
@@ -158,15 +159,17 @@ fn write(page: &Page, path: &Path) {
         (277, 4, vec![1]),
         (317, 4, vec![page.predictor as u32]),
         (320, 3, map),
-        (322, 4, vec![tw as u32]),
-        (323, 4, vec![th as u32]),
-        (324, 4, offsets),
-        (325, 4, counts),
+        (if strip { 273 } else { 324 }, 4, offsets),
+        (if strip { 279 } else { 325 }, 4, counts),
+        (322, 4, if strip { vec![] } else { vec![tw as u32] }),
+        (323, 4, if strip { vec![] } else { vec![th as u32] }),
+        (278, 4, if strip { vec![th as u32] } else { vec![] }),
         (339, 4, vec![format]),
         (32997, 4, vec![page.depth]),
         (32998, 4, vec![page.depth]),
     ];
-    let tags: Vec<_> = tags.into_iter().filter(|t| !t.2.is_empty()).collect();
+    let mut tags: Vec<_> = tags.into_iter().filter(|t| !t.2.is_empty()).collect();
+    tags.sort_by_key(|t| t.0);
     let mut directory = (tags.len() as u16).to_le_bytes().to_vec();
     for (tag, kind, values) in tags {
         directory.extend(tag.to_le_bytes());
@@ -231,7 +234,8 @@ fn palettes_and_volumetric_tiles_are_refused_by_name() {
     write(&PAGE, &path);
     Source::open(&file_input(&path)).unwrap();
     // What ImageJ keeps as a palette is how it shows grey values.
-    write(&Page { photometric: 3, compression: 1, description: "ImageJ=1.53t\n\0", ..PAGE }, &path);
+    let tile = [PAGE.height, PAGE.width];
+    write(&Page { photometric: 3, compression: 1, tile, description: "ImageJ=1.53t\n\0", ..PAGE }, &path);
     let (_, voxels) = whole(&file_input(&path), 0).unwrap();
     assert!((0..voxels.len()).all(|i| voxels.at(i) == value(DType::U8, i / PAGE.width, i % PAGE.width)));
 }
