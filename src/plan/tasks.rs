@@ -4,7 +4,7 @@
 //! depends on shapes, halos, chunks and shards only, never on bricks, threads or budget, so that a resumed run may change those.
 
 use super::graph::Graph;
-use super::graph::{StepId, WireId, max3};
+use super::graph::{StepId, WireId, add3, max3};
 use super::{BrickChoice, OutputPlan, Plan};
 use crate::config::OutputFormat;
 use crate::gpu::maps::{MapJob, MapLevel};
@@ -236,7 +236,9 @@ fn fill_group(plan: &Plan, group: &mut Group) {
         // Planes of a flat file are written in one go; parts of rows take a call each.
         (1..3).for_each(|a| base[a] = shape[a].min(TASK_EDGES[0]).next_multiple_of(base[a]));
     }
-    let halo = group.inputs.iter().flat_map(|&w| input_halo(plan, group, w)).max().unwrap_or(0);
+    // What sweeps see counts whether they read it as boxes or by columns, which the budget decides.
+    let seen = group.steps.iter().map(|&s| &plan.graph.steps[s]).map(|s| add3(s.halo, s.reach));
+    let halo = group.inputs.iter().map(|&w| input_halo(plan, group, w)).chain(seen).flatten().max().unwrap_or(0);
     group.task = choose_task(&outputs, base, shape, halo);
     group.tasks = std::array::from_fn(|a| shape[a].div_ceil(group.task[a]).max(1));
 }
