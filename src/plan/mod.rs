@@ -87,7 +87,6 @@ impl Plan {
     /// `find_gpu` is called at most once, when a GPU could be used.
     pub fn new(config: &Config, infos: &[VolumeInfo], find_gpu: FindGpu) -> Result<Plan> {
         let mut lowered = lower::lower(config, infos)?;
-        fills::check(config, &lowered.graph)?;
         let outputs = outputs::plan_outputs(config, infos, &mut lowered)?;
         let threads = match config.run.threads {
             0 => std::thread::available_parallelism().map_or(1, |n| n.get()),
@@ -101,6 +100,7 @@ impl Plan {
         let mut warnings: Vec<String> =
             inputs.flat_map(|(i, info)| info.warnings.iter().map(|w| format!("input {}: {w}", i.name))).collect();
         warnings.extend(long_windows(&graph));
+        warnings.extend(fills::warnings(config, &graph));
         let mut plan = Plan {
             groups: Vec::new(),
             prepasses: lowered.prepasses,

@@ -146,7 +146,11 @@ impl Window {
                 (f64::INFINITY, ..) => 1.0,
                 (f64::NEG_INFINITY, ..) => 0.0,
                 (_, true, true) => f64::NAN,
-                (_, _, max) => f64::from(u8::from(!max)),
+                // By how many spreads an infinite mean is away hangs on how many infinities there are.
+                _ if method == Method::GaussianCdf => f64::NAN,
+                (_, true, _) if matches!(method, Method::Chebyshev | Method::ChebyshevLiteral) => f64::NAN,
+                (_, _, true) => f64::from(u8::from(method == Method::ChebyshevLiteral)),
+                _ => 1.0,
             };
         }
         let [v, min, max] = [v, min, max].map(|v| v * self.scale);
