@@ -243,15 +243,15 @@ fn fill_group(plan: &Plan, group: &mut Group) {
     group.tasks = std::array::from_fn(|a| shape[a].div_ceil(group.task[a]).max(1));
 }
 
-/// The first of [`TASK_EDGES`] that cuts the region into [`LEAST_TASKS`], or the least that the halo allows.
+/// The first of [`TASK_EDGES`] that cuts the region into [`LEAST_TASKS`]; where files and halos allow none, the least that they
+/// allow, unless that leaves more than three quarters in one piece.
 fn choose_task(outputs: &[&OutputPlan], base: Shape, region: Shape, halo: usize) -> Shape {
     let allowed = |edge: usize| edge == TASK_EDGES[0] || edge >= HALOS_PER_EDGE * halo;
     let shapes = TASK_EDGES.into_iter().filter(|&e| allowed(e)).map(|edge| task_shape(outputs, base, edge));
-    let small = |task: &Shape| {
-        let most: usize = (0..3).map(|a| task[a].min(region[a])).product();
-        most * LEAST_TASKS <= region.iter().product()
-    };
-    shapes.clone().find(small).or(shapes.clone().next_back()).unwrap_or(base)
+    let whole: usize = region.iter().product();
+    let most = |task: &Shape| (0..3).map(|a| task[a].min(region[a])).product::<usize>();
+    let least = shapes.clone().next_back().filter(|task| most(task) * 4 <= whole * 3);
+    shapes.clone().find(|task| most(task) * LEAST_TASKS <= whole).or(least).or(shapes.clone().next()).unwrap_or(base)
 }
 
 /// Grows a task from the files of level 0 to those of further levels while it stays near `edge`.
