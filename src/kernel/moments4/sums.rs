@@ -87,8 +87,10 @@ fn slide_inner<T: Code, const C: usize, const M: bool>(
 ) {
     let blocks = new.len().max(old.len()).div_ceil(LANES);
     for (b, sums) in sums.chunks_exact_mut(LANES * C).take(blocks).enumerate() {
-        let part = |row: &[T]| eight::<T, C, M>(&row[(b * LANES).min(row.len())..], missing);
-        let (new, old) = (part(new), part(old));
+        let tail = (b * LANES).min(new.len())..;
+        let new = eight::<T, C, M>(&new[tail], missing);
+        let tail = (b * LANES).min(old.len())..;
+        let old = eight::<T, C, M>(&old[tail], missing);
         for (c, sums) in sums.chunks_exact_mut(LANES).enumerate() {
             for i in 0..LANES {
                 sums[i] = sums[i].wrapping_add(new[c][i]).wrapping_sub(old[c][i]);

@@ -33,8 +33,6 @@ pub trait RowExtremes: Sized {
     }
 }
 
-impl RowExtremes for f64 {}
-
 #[cfg(not(target_arch = "x86_64"))]
 mod wide {
     use super::RowExtremes;
@@ -42,6 +40,7 @@ mod wide {
     impl RowExtremes for u16 {}
     impl RowExtremes for u32 {}
     impl RowExtremes for f32 {}
+    impl RowExtremes for f64 {}
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -61,6 +60,18 @@ mod wide {
     #[target_feature(enable = "avx512f")]
     fn max_f32(a: __m512i, b: __m512i) -> __m512i {
         _mm512_castps_si512(_mm512_max_ps(_mm512_castsi512_ps(a), _mm512_castsi512_ps(b)))
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    fn min_f64(a: __m512i, b: __m512i) -> __m512i {
+        _mm512_castpd_si512(_mm512_min_pd(_mm512_castsi512_pd(a), _mm512_castsi512_pd(b)))
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    fn max_f64(a: __m512i, b: __m512i) -> __m512i {
+        _mm512_castpd_si512(_mm512_max_pd(_mm512_castsi512_pd(a), _mm512_castsi512_pd(b)))
     }
 
     /// Levels of doubling below `P`: each keeps its vector for the one before.
@@ -246,6 +257,7 @@ mod wide {
         u16, u16, 32, extremes_u16, long_u16, _mm512_min_epu16, _mm512_max_epu16, _mm512_permutex2var_epi16;
         u32, u32, 16, extremes_u32, long_u32, _mm512_min_epu32, _mm512_max_epu32, _mm512_permutex2var_epi32;
         f32, u32, 16, extremes_f32, long_f32, min_f32, max_f32, _mm512_permutex2var_epi32;
+        f64, u64, 8, extremes_f64, long_f64, min_f64, max_f64, _mm512_permutex2var_epi64;
     }
 }
 
@@ -287,5 +299,6 @@ mod tests {
         check_extremes(|i| (i >> 7) as u16);
         check_extremes(|i| i);
         check_extremes(|i| i as f32 - 1e8);
+        check_extremes(|i| i as f64 - 1e8);
     }
 }

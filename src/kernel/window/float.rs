@@ -9,7 +9,8 @@ use std::ops::Range;
 use super::along::SLACK;
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
 use super::extremes::{blocked, deep_len, rows_extremes};
-use super::float_estimate::{self as est, Centre};
+use super::float_estimate as est;
+use super::float_power::{self, Centre, Windows};
 use super::lines::{self, Coding, Elem, Masked, Pitches, Sources};
 use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};
@@ -251,7 +252,9 @@ pub fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: 
                 let polarity = polarity(emit.params, ties);
                 let (v, lo, hi) = (row.v, &row.lo[..len], &row.hi[..len]);
                 let fill = |o: &mut [f32]| match estimator(method) {
-                    Estimator::Power => T::cdf_power(level, v, lo, hi, row.s, n, polarity, o),
+                    Estimator::Power => {
+                        float_power::cdf_power(level, &Windows { v, lo, hi, s: row.s, n }, polarity, o);
+                    }
                     Estimator::Beta => est::beta_row(level, v, lo, hi, row.s, row.m, n, polarity, o),
                     Estimator::Spread(kind) => est::spread_row(level, kind, v, lo, hi, row.s, row.m, n, polarity, o),
                 };

@@ -3,7 +3,7 @@
 use super::beta::{self, Terms};
 use super::estimate::{Polarity, Spread};
 use super::math;
-use super::merge::{Pair, Sum};
+use super::merge::Sum;
 use crate::grid::{Affine, Voxel};
 use crate::kernel::simd::Level;
 
@@ -99,154 +99,9 @@ fn extreme_inner<T: Voxel>(from: &[T], affine: Affine, out: &mut [T]) {
     }
 }
 
-/// Float voxels at the centre of a window.
-pub trait Centre: Voxel {
-    type Total: Sum;
-    /// A 3.2 for a row.
-    #[allow(clippy::too_many_arguments)]
-    fn cdf_power(
-        level: Level,
-        v: &[Self],
-        lo: &[Self],
-        hi: &[Self],
-        s: &[Self::Total],
-        n: &[f64],
-        polarity: Polarity,
-        out: &mut [f32],
-    );
-}
-
-impl Centre for f32 {
-    type Total = f64;
-    fn cdf_power(
-        level: Level,
-        v: &[f32],
-        lo: &[f32],
-        hi: &[f32],
-        s: &[f64],
-        n: &[f64],
-        polarity: Polarity,
-        out: &mut [f32],
-    ) {
-        if power_row(level, v, lo, hi, s, n, polarity, out) {
-            for i in 0..out.len() {
-                if !tame(v[i] - lo[i], hi[i] - v[i], hi[i] - lo[i]) {
-                    out[i] = power_voxel(v[i], lo[i], hi[i], s[i], n[i], polarity);
-                }
-            }
-        }
-    }
-}
-
-impl Centre for f64 {
-    type Total = Pair;
-    fn cdf_power(
-        _: Level,
-        v: &[f64],
-        lo: &[f64],
-        hi: &[f64],
-        s: &[Pair],
-        n: &[f64],
-        polarity: Polarity,
-        out: &mut [f32],
-    ) {
-        for (i, o) in out.iter_mut().enumerate() {
-            *o = power_voxel(v[i], lo[i], hi[i], s[i], n[i], polarity);
-        }
-    }
-}
-
-/// Whether f32 holds every quotient that the fast form takes: the range and n times it neither overflow nor vanish, and
-/// neither share of it underflows.
-#[inline(always)]
-fn tame(below: f32, above: f32, range: f32) -> bool {
-    const SMALL: f32 = 8.077_936e-28; // 2^-90
-    const LARGE: f32 = 1.237_940_1e27; // 2^90
-    let least = range * SMALL;
-    let shares = (below >= least || below == 0.0) & (above >= least || above == 0.0);
-    ((range > SMALL) & (range < LARGE) & shares) | (range == 0.0)
-}
-
-crate::multiversion! {
-    /// `t^beta` in f32 from exactly rounded differences; returns whether some voxel needs [`power_voxel`].
-    fn power_row[](
-        v: &[f32], lo: &[f32], hi: &[f32], s: &[f64], n: &[f64], polarity: Polarity, out: &mut [f32]
-    ) -> bool = power_row_inner;
-}
-
-#[inline(always)]
-fn power_row_inner(
-    v: &[f32],
-    lo: &[f32],
-    hi: &[f32],
-    s: &[f64],
-    n: &[f64],
-    polarity: Polarity,
-    out: &mut [f32],
-) -> bool {
-    if polarity.flipped {
-        power_row_as::<true>(v, lo, hi, s, n, polarity.constant, out)
-    } else {
-        power_row_as::<false>(v, lo, hi, s, n, polarity.constant, out)
-    }
-}
-
-#[inline(always)]
-fn power_row_as<const FLIPPED: bool>(
-    v: &[f32],
-    lo: &[f32],
-    hi: &[f32],
-    s: &[f64],
-    n: &[f64],
-    constant: f32,
-    out: &mut [f32],
-) -> bool {
-    let len = out.len();
-    let (v, lo, hi, s, n) = (&v[..len], &lo[..len], &hi[..len], &s[..len], &n[..len]);
-    let mut wild = 0u32;
-    for i in 0..len {
-        let (below, above, range) = (v[i] - lo[i], hi[i] - v[i], hi[i] - lo[i]);
-        wild |= !tame(below, above, range) as u32;
-        // Both lie in range..n range, and the sum is right to 2^-53 of itself or exact where that matters.
-        let over = (-n[i]).mul_add(lo[i] as f64, s[i]) as f32;
-        let under = n[i].mul_add(hi[i] as f64, -s[i]) as f32;
-        let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
-        let beta = p / q;
-        let beta = if beta > 1e-6 { beta } else { 1e-6 };
-        let beta = if beta < 1e6 { beta } else { 1e6 };
-        let y = math::power(a, b, range, beta);
-        let y = if a == 0.0 { 0.0 } else { y };
-        let y = if b == 0.0 { 1.0 } else { y };
-        out[i] = if range == 0.0 { constant } else { y };
-    }
-    wild != 0
-}
-
-/// `t^beta` of any finite or infinite window, in f64.
-fn power_voxel<T: Voxel, A: Sum>(v: T, lo: T, hi: T, s: A, n: f64, polarity: Polarity) -> f32 {
-    let (v, lo, hi) = (v.to_f64(), lo.to_f64(), hi.to_f64());
-    if lo == hi {
-        return polarity.constant;
-    }
-    if !lo.is_finite() || !hi.is_finite() {
-        return infinite(v, lo, hi, polarity.flipped, [1.0, 0.0]);
-    }
-    // Halves: the range of f64 values may exceed the largest of them.
-    let (below, above, range) = (0.5 * v - 0.5 * lo, 0.5 * hi - 0.5 * v, 0.5 * hi - 0.5 * lo);
-    let (over, under) = (s.less(n, lo), -s.less(n, hi));
-    let (a, b, p, q) = if polarity.flipped { (above, below, under, over) } else { (below, above, over, under) };
-    if a == 0.0 || b == 0.0 {
-        return if b == 0.0 { 1.0 } else { 0.0 };
-    }
-    let beta = (p / q).clamp(1e-6, 1e6);
-    let log =
-        if 3.0 * b < range { math::log2_1p((-b / range) as f32) as f64 } else { math::log2(a) - math::log2(range) };
-    math::exp2((beta * log) as f32)
-}
-
 /// Openness of a window that holds an infinity and is not constant: 1 at +inf, 0 at -inf; else `above` where there is
 /// only +inf, `below` where there is only -inf, NaN where both meet.
-fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, [below, above]: [f32; 2]) -> f32 {
+pub fn infinite(v: f64, lo: f64, hi: f64, flipped: bool, [below, above]: [f32; 2]) -> f32 {
     let (v, lo, hi) = if flipped { (-v, -hi, -lo) } else { (v, lo, hi) };
     if v == f64::INFINITY {
         1.0

@@ -31,29 +31,6 @@ fn log2_ratio(f: f32) -> f32 {
         .mul_add(f, 1.442_694_8)
 }
 
-/// `t^beta` for `t = a / range`, `1 - t = b / range`, `0 < a`, `0 <= b`, `range` normal.
-///
-/// With E = beta log2 t the absolute error of 2^E is E ln2 2^E times the *relative* error of E, at most 0.37 of it. So all
-/// that matters is a relatively accurate logarithm: near t = 1 it is log1p of `-b / range`, whose numerator the caller
-/// has without cancellation. Absolute error at most 1e-6 for every beta.
-#[inline(always)]
-pub fn power(a: f32, b: f32, range: f32, beta: f32) -> f32 {
-    let near = 3.0 * b < range;
-    power_of(if near { -b } else { a } / range, near, beta)
-}
-
-/// `t^beta` from `q = t`, or where `near` from `q = t - 1` in (-1/3, 0].
-#[inline(always)]
-fn power_of(q: f32, near: bool, beta: f32) -> f32 {
-    const TWO_THIRDS: u32 = 0x3f2a_aaab;
-    let bits = q.to_bits().wrapping_sub(TWO_THIRDS);
-    let exponent = ((bits as i32) >> 23) as f32;
-    let mantissa = f32::from_bits((bits & 0x7f_ffff) + TWO_THIRDS) - 1.0;
-    let f = if near { q } else { mantissa };
-    let e = if near { 0.0 } else { exponent };
-    exp2(beta * f.mul_add(log2_ratio(f), e))
-}
-
 /// `log2(1 + f)` for `f` in [-1/3, 1/3], relative error 1.1e-6.
 #[inline(always)]
 pub fn log2_1p(f: f32) -> f32 {
@@ -130,24 +107,6 @@ pub fn quantise(o: f32) -> u8 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn power_is_within_1e6_of_exact_for_every_beta() {
-        let mut worst = 0f64;
-        for i in 0..4000u32 {
-            let (a, range) = (1 + i * i % 65535, 65535f32);
-            let b = 65535 - a;
-            for j in -20..=20 {
-                let beta = 10f32.powf(j as f32 * 0.3);
-                let t = a as f64 / 65535.0;
-                let log = if b < 30000 { (-(b as f64) / 65535.0).ln_1p() } else { t.ln() };
-                let exact = (beta as f64 * log).exp();
-                worst = worst.max((power(a as f32, b as f32, range, beta) as f64 - exact).abs());
-            }
-        }
-        assert!(worst < 1e-6, "{worst}");
-        assert_eq!(power(5.0, 0.0, 5.0, 1e6), 1.0);
-    }
 
     #[test]
     fn phi_is_symmetric_and_right_at_known_points() {

@@ -20,6 +20,7 @@ mod finish;
 pub mod finish_floats;
 mod float;
 mod float_estimate;
+mod float_power;
 mod int;
 mod lines;
 #[doc(hidden)]

@@ -24,7 +24,7 @@ mod spread;
 #[cfg(test)]
 mod tests;
 
-pub use power::cdf_power_rows;
+pub use power::{STRIP, Strip, cdf_power_rows, powers};
 pub use spread::{Squares, spread_rows};
 
 /// Windows of consecutive rows: row `k` of the centres (codes before `flip`) starts at `k * v_pitch`, of the counts `n` at
