@@ -228,6 +228,7 @@ pub(super) use numerators;
 /// The numerator of one window by each [`Width`].
 pub mod numerator {
     use super::{Acc, RowSum};
+    use crate::kernel::window::exact;
 
     #[inline(always)]
     fn fused(n: f64, s1: f64, s2: f64) -> f64 {
@@ -258,7 +259,7 @@ pub mod numerator {
     #[inline(always)]
     pub fn big<X1: RowSum, X2: Acc>(s1: X1, s2: X2, n: u32) -> f64 {
         let (a, m) = (s1.wide(), n as u128);
-        m.wrapping_mul(s2.wide()).wrapping_sub(a * a) as f64
+        exact::split(m.wrapping_mul(s2.wide()).wrapping_sub(a * a))[0]
     }
 }
 
