@@ -86,7 +86,7 @@ fn wrong_usage_is_2_and_leaves_stdout_empty() {
 }
 
 #[test]
-fn no_result_is_written_over_what_is_read() {
+fn no_result_is_written_over_what_is_read_or_into_an_output() {
     let folder = tempfile::tempdir().unwrap();
     let f = folder.path();
     npy(&f.join("a.npy"), [3, 4, 5], |i| i as f32);
@@ -103,6 +103,12 @@ fn no_result_is_written_over_what_is_read() {
     ] {
         let (code, _, err) = call(f, &args);
         assert!(code == 2 && err.contains("which is read"), "{args:?}: {err}");
+    }
+    std::fs::create_dir(f.join("z.zarr")).unwrap();
+    let zarr = ["--set", "output.z.path=z.zarr", "--set", "output.z.from=a"];
+    for (flag, path) in [("--report", "o.npy"), ("--trace", "z.zarr/zarr.json"), ("--report", "z.zarr/../z.zarr/r")] {
+        let (code, _, err) = call(f, &[&["run", "c.toml", flag, path][..], &zarr].concat());
+        assert!(code == 2 && err.contains(flag) && err.contains("output"), "{flag} {path}: {err}");
     }
     assert!(std::fs::read(f.join("a.npy")).unwrap() == before && !f.join("o.npy").exists());
 }

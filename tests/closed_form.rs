@@ -173,9 +173,13 @@ fn levels_of_a_variance_pool_unrounded_means() {
     write_npy(&dir.path().join("floats.npy"), "<f4", shape, &f32_bytes(&floats));
     let counts: Vec<u16> = fill(shape, |z, y, x| 65000 + (value(z, y, x) as u64 % 3) as u16);
     write_npy(&dir.path().join("counts.npy"), "<u2", shape, &u16_bytes(&counts));
+    let doubles: Vec<f64> = fill(shape, |z, y, x| value(z, y, x) + 0.1);
+    let bytes: Vec<u8> = doubles.iter().flat_map(|v| v.to_le_bytes()).collect();
+    write_npy(&dir.path().join("doubles.npy"), "<f8", shape, &bytes);
     let volumes = [
         ("floats", floats.iter().map(|v| *v as f64).collect::<Vec<_>>()),
         ("counts", counts.iter().map(|v| *v as f64).collect()),
+        ("doubles", doubles),
     ];
     for (input, voxels) in &volumes {
         for (name, stage, reach) in [("box", "op = 'box'\nradius = 1", 1), ("bell", "op = 'gaussian'\nsigma = 0.6", 2)]
@@ -185,9 +189,15 @@ fn levels_of_a_variance_pool_unrounded_means() {
             for channel in ["variance", "std"].into_iter().filter(|c| *c == "variance" || name == "box") {
                 let text = format!(
                     "[run]\nbrick = 8\n[input.v]\npath = '{input}.npy'\n[stage.s]\n{stage}\ninput = 'v'\n[output.o]\n\
-                     path = 'o.zarr'\nfrom = 's.{channel}'\nreduce = 'moments'\nchunk = 4\nlevels = 3\n"
+                     path = 'o.zarr'\nfrom = 's.{channel}'\nreduce = 'moments'\nchunk = 4\nlevels = 3\n[output.mean]\npath = 'mean.npy'\nfrom = 's.mean'\n"
                 );
                 run(dir.path(), &text, &[]);
+                // Beside the means that levels pool stand those that were asked for.
+                let (_, means) = &decode(&dir.path().join("mean.npy"))["level 0 component 0"];
+                for (bits, window) in means.iter().zip(&windows) {
+                    let (got, expect) = (f64::from_bits(*bits), window[0] + voxels[0]);
+                    assert!((got - expect).abs() <= 2e-7 * expect, "{name}.mean of {input}: {got}, {expect} expected");
+                }
                 let decoded = decode(&dir.path().join("o.zarr"));
                 for level in 1..3 {
                     let (cells, bits) = &decoded[&format!("level {level} component 0")];

@@ -149,6 +149,18 @@ from = "s"
     assert!(plan["peak_memory_bytes"].as_u64().unwrap() <= plan["memory_budget_bytes"].as_u64().unwrap(), "{text}");
 }
 
+/// A brick that was asked for larger than the volume takes what the volume does.
+#[test]
+fn bricks_are_no_larger_than_the_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let text = "[run]\nmemory = \"64MiB\"\nthreads = 1\n[input.a]\nsynthetic = \"noise\"\nshape = [20, 30, 24]\n[stage.s]\n\
+                op = \"box\"\ninput = \"a\"\nradius = 2\n[output.o]\npath = \"o.npy\"\nfrom = \"s\"\n";
+    run(dir.path(), text, &["run.brick=5000"]);
+    let message = parse(dir.path(), text, &["run.brick=5000", "input.a.shape=[900, 900, 900]"]);
+    let message = occlude::plan::explain(&message).unwrap_err().to_string();
+    assert!(message.contains("run.brick") && !message.contains("smallest"), "{message}");
+}
+
 /// Chunks between bricks are decoded about once, though the budget holds a small part of the volume: the cache knows which
 /// brick needs a chunk next. Kept by last use they would be read 1.4 times here.
 #[test]

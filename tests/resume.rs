@@ -395,3 +395,39 @@ fn a_finished_file_that_was_deleted_is_made_again() {
         assert!(part.exists());
     }
 }
+
+/// An output that was deleted is made again, whole, beside those that are complete or begun.
+#[test]
+fn deleted_outputs_are_made_again_beside_the_others() {
+    let dir = folder();
+    run(dir.path(), CONFIG, &[]);
+    let expected = decoded(dir.path());
+    let config = parse(dir.path(), CONFIG, &[]);
+    let resume = RunOptions { resume: true, ..Default::default() };
+    let same = |what: &str| {
+        for (name, (a, b)) in OUTPUTS.iter().zip(expected.iter().zip(&decoded(dir.path()))) {
+            assert_same(&format!("{name}, {what}"), a, b);
+        }
+    };
+    let delete = |name: &str| {
+        let path = dir.path().join("out").join(name);
+        if path.is_dir() { fs::remove_dir_all(&path).unwrap() } else { fs::remove_file(&path).unwrap() }
+    };
+    for name in OUTPUTS {
+        delete(name);
+        assert!(run_with(&config, &resume).bricks.computed > 0, "{name}");
+        same(&format!("after {name} was deleted"));
+        assert_eq!(run_with(&config, &resume).bricks.computed, 0, "{name}");
+    }
+    // Begun: what done tasks left in it is gone.
+    let again = RunOptions { overwrite: true, ..Default::default() };
+    let session = Session::open(&config, &again, &Silent).map_err(|e| e.to_string()).unwrap_or_else(|e| panic!("{e}"));
+    session.run_task(session.open_tasks()[0]).unwrap();
+    drop(session);
+    delete(OUTPUTS[0]);
+    run_with(&config, &resume);
+    same("begun and deleted");
+    fs::remove_dir_all(dir.path().join("out").join(OUTPUTS[0]).join("0")).unwrap();
+    let error = occlude::run::run(&config, &resume, &Silent).unwrap_err().to_string();
+    assert!(error.contains(OUTPUTS[0]) && error.contains("level 0, which is gone"), "{error}");
+}

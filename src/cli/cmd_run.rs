@@ -4,6 +4,7 @@ use super::args::RunArgs;
 use super::progress::Shown;
 use super::{human, load, messages, refuse_overwriting, usage, write_whole};
 use crate::config::InputKind;
+use crate::config::check::resolved;
 use crate::run::{self, Report, RunOptions};
 use crate::{Error, Result};
 
@@ -22,6 +23,11 @@ pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
             InputKind::Synthetic { .. } => None,
         });
         refuse_overwriting(flag, path, inputs.chain([config.file.as_path()]))?;
+        let real = resolved(path);
+        if let Some(o) = config.outputs.iter().find(|o| real.starts_with(resolved(&o.path))) {
+            let message = format!("got {}, which output {:?} writes; expected another file", path.display(), o.name);
+            return Err(usage(flag, message));
+        }
     }
     let options = RunOptions {
         resume: args.resume,

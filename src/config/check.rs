@@ -200,7 +200,7 @@ fn paths(config: &Config) -> Result<()> {
 }
 
 /// Absolute, without `.` and `..`, links in the part that exists followed.
-fn resolved(path: &Path) -> PathBuf {
+pub fn resolved(path: &Path) -> PathBuf {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
     let mut clean = PathBuf::new();
     for part in absolute.components() {

@@ -168,7 +168,7 @@ impl Names {
             format!(
                 "no input or stage is named {name:?}{}; named are: {}",
                 suggest::hint(name, names()),
-                given.join(", ")
+                if given.is_empty() { "none".into() } else { given.join(", ") }
             )
         };
         let Some((name, channel)) = text.rsplit_once('.') else { return Err(unknown(text).into()) };

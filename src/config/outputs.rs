@@ -92,7 +92,7 @@ fn format(r: &Reader, path: &Path) -> Result<OutputFormat> {
         "npy" => Ok(OutputFormat::Npy),
         "raw" => Ok(OutputFormat::Raw),
         _ => {
-            let given = path.file_name().unwrap_or_default().to_string_lossy();
+            let given = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy();
             let gzip = if extension == "gz" { " (gzip is not written)" } else { "" };
             let message = format!(
                 "got {given:?}, whose extension names no format{gzip}; expected .zarr, .nrrd, .nii, .npy or .raw, or the key format = {}",

@@ -50,16 +50,18 @@ impl BrickChoice {
 /// Chooses the brick of a group and says its relative time per voxel, or refuses with the least budget that would do.
 pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<(BrickChoice, f64)> {
     if let Some(asked) = config.run.brick {
-        let shape = round_up(asked.map(|n| n.max(1)), group.align, group.task);
+        // No more than there is: memory is for voxels that exist.
+        let region = group.region.shape();
+        let shape = round_up(std::array::from_fn(|a| asked[a].clamp(1, region[a])), group.align, group.task);
         let why = if shape == asked {
             "as asked".to_string()
         } else {
             format!(
-                "asked for {asked:?}; bricks are multiples of {:?} and at most a task of {:?}",
+                "asked for {asked:?}; bricks are multiples of {:?}, at most a task of {:?} and no larger than the volume needs",
                 group.align, group.task
             )
         };
-        let choice = fit(plan, group, shape, why).ok_or_else(|| refuse(plan, group, shape, config))?;
+        let choice = fit(plan, group, shape, why).ok_or_else(|| refuse(plan, group, shape, "run.brick", config))?;
         let cost = cost(plan, group, shape, &choice);
         return Ok((choice, cost));
     }
@@ -80,7 +82,7 @@ pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<(BrickChoic
             );
             Ok((choice, cost))
         }
-        None => Err(refuse(plan, group, least(group), config)),
+        None => Err(refuse(plan, group, least(group), "the smallest", config)),
     }
 }
 
@@ -250,12 +252,12 @@ pub fn least_bytes(plan: &Plan, group: &Group) -> u64 {
     one_brick(plan, group, least(group))[1]
 }
 
-fn refuse(plan: &Plan, group: &Group, shape: Shape, config: &Config) -> Error {
+fn refuse(plan: &Plan, group: &Group, shape: Shape, which: &str, config: &Config) -> Error {
     let [bytes, need] = one_brick(plan, group, shape);
     config.locate(Error::config(
         "run.memory",
         format!(
-            "{} is too little for one brick: the smallest, {shape:?} voxels (z, y, x), with its halo, results and scratch \
+            "{} is too little for one brick: {which}, {shape:?} voxels (z, y, x), with its halo, results and scratch \
              takes {}, beside {} that every run holds; give at least memory = \"{}MiB\"",
             mib(plan.memory),
             mib(bytes),

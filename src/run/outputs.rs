@@ -38,7 +38,8 @@ pub fn is_complete(plan: &Plan, o: usize, header: &Value) -> bool {
         return false;
     };
     let inputs = attributes["input"].as_array().into_iter().flatten().map(|i| &i["identity"]);
-    attributes["config_hash"] == header["config_hash"]
+    missing_level(&plan.outputs[o]).is_none()
+        && attributes["config_hash"] == header["config_hash"]
         && header["inputs"].as_array().is_some_and(|wanted| inputs.eq(wanted))
 }
 
@@ -87,33 +88,60 @@ pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwri
             return Err(refused(config, output, "exists; --resume continues it, --overwrite deletes it first"));
         }
     }
-    if (0..plan.outputs.len()).all(|o| is_complete(plan, o, header)) {
+    let complete: Vec<bool> = (0..plan.outputs.len()).map(|o| is_complete(plan, o, header)).collect();
+    if !complete.contains(&false) {
         return Ok(Start::Complete);
     }
-    let Some(earlier) = journal::Journal::read(&journal_dir(plan)) else {
-        return no_journal(config, plan, &found);
-    };
-    if let Some(what) = journal::difference(&earlier.header, header) {
-        let last = plan.outputs.last().expect("a config has outputs");
-        let message = format!("was begun with other settings: {what} changed; --overwrite starts afresh");
-        return Err(refused(config, last, &message));
-    }
-    Ok(Start::Resume { done: earlier.done, globals: journal::globals(&earlier.header) })
-}
-
-/// Outputs of ours without a journal: begun and killed before the first line (start afresh), or complete from another run.
-fn no_journal(config: &Config, plan: &Plan, found: &[Existing]) -> Result<Start> {
-    for (output, found) in plan.outputs.iter().zip(found) {
-        if matches!(found, Existing::Ours { complete: true, .. }) {
-            let message =
-                "is complete and was made with other settings or from another input; --overwrite deletes it first";
-            return Err(refused(config, output, message));
+    if let Some(earlier) = journal::Journal::read(&journal_dir(plan)) {
+        if let Some(what) = journal::difference(&earlier.header, header) {
+            let last = plan.outputs.last().expect("a config has outputs");
+            let message = format!("was begun with other settings: {what} changed; --overwrite starts afresh");
+            return Err(refused(config, last, &message));
+        }
+        // All are begun before the first task: one that is not there was deleted, and what tasks left in it is gone.
+        let mut pairs = plan.outputs.iter().zip(&found);
+        if pairs.all(|(output, found)| *found != Existing::None && missing_level(output).is_none()) {
+            return Ok(Start::Resume { done: earlier.done, globals: journal::globals(&earlier.header) });
         }
     }
-    for output in &plan.outputs {
+    make_others(config, plan, &found, &complete)
+}
+
+/// No task counts as done: killed before the journal's first line, or an output was deleted since. What is complete stays, the
+/// others are made from the start.
+fn make_others(config: &Config, plan: &Plan, found: &[Existing], complete: &[bool]) -> Result<Start> {
+    let others = || plan.outputs.iter().zip(found).zip(complete).filter(|(_, complete)| !**complete);
+    for ((output, found), _) in others() {
+        if matches!(found, Existing::Ours { complete: true, .. }) {
+            let message = match missing_level(output) {
+                Some(level) => {
+                    format!("is complete but for level {level}, which is gone; --overwrite deletes it first")
+                }
+                None => {
+                    "is complete and was made with other settings or from another input; --overwrite deletes it first"
+                        .to_string()
+                }
+            };
+            return Err(refused(config, output, &message));
+        }
+    }
+    for ((output, _), _) in others() {
         clear(config, output)?;
     }
-    Ok(Start::Afresh)
+    journal::remove(&journal_dir(plan));
+    match complete.contains(&true) {
+        true => Ok(Start::Resume { done: Vec::new(), globals: Vec::new() }),
+        false => Ok(Start::Afresh),
+    }
+}
+
+/// The first level of a Zarr output whose array is not there.
+fn missing_level(output: &OutputPlan) -> Option<usize> {
+    let there = |k: &usize| {
+        let folder = output.spec.path.join(k.to_string());
+        ["zarr.json", ".zarray"].iter().any(|name| folder.join(name).is_file())
+    };
+    (0..output.spec.pyramid.levels.len()).find(|k| output.is_zarr() && !there(k))
 }
 
 fn config_output<'a>(config: &'a Config, output: &OutputPlan) -> &'a Output {
@@ -128,7 +156,7 @@ fn refused(config: &Config, output: &OutputPlan, what: &str) -> Error {
 fn clear(config: &Config, output: &OutputPlan) -> Result<()> {
     let found = existing(&output.spec.path);
     refuse_foreign(config, output, &found)?;
-    if matches!(found, Existing::None) { Ok(()) } else { remove_ours(&output.spec.path) }
+    remove_ours(&output.spec.path)
 }
 
 fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Result<()> {

@@ -166,6 +166,10 @@ impl<'a> Session<'a> {
                     self.plan.outputs[o].spec.forget_work()?;
                 }
             }
+            let group = &self.plan.groups[g];
+            if group.outputs.iter().all(|&o| self.targets[o].is_none()) {
+                self.done[group.first_task..][..group.task_count()].fill(true);
+            }
         }
         self.journal = Some(Journal::open(&outputs::journal_dir(&self.plan), &header, resume)?);
         Ok(())

@@ -296,7 +296,7 @@ impl<'a> Engine<'a> {
                 let (mut mean, mut unrounded, mut variance) = (None, None, None);
                 for (channel, value) in channels.iter().zip(outputs) {
                     match (channel, value.dtype) {
-                        (Moment::Mean, dtype) if dtype != src.view().dtype().result() => {
+                        (Moment::Mean, dtype) if dtype != src.view().dtype().result() || mean.is_some() => {
                             unrounded = Some(view_mut(value, c))
                         }
                         (Moment::Mean, _) => mean = Some(view_mut(value, c)),

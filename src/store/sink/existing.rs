@@ -135,6 +135,8 @@ fn is_real_dir(path: &Path) -> bool {
 /// them stay. Refuses what it did not write.
 pub fn remove_ours(path: &Path) -> Result<()> {
     match existing(path) {
+        // At most the marker of what was deleted by hand.
+        Existing::None if meta_of(path).is_some() => return remove_work_dir(&Sink::work_dir(path)),
         Existing::None => return Ok(()),
         Existing::Foreign => {
             let message = "was not written by this program (or was changed since) and is left alone; \
