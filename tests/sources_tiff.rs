@@ -131,7 +131,11 @@ fn tile(page: &Page, ty: usize, tx: usize) -> Vec<u8> {
         }
         predict(&mut bytes[start..], page.dtype.size(), page.predictor);
     }
-    if page.compression == 5 { lzw(&bytes) } else { bytes }
+    match page.compression {
+        5 => lzw(&bytes),
+        50000 => zstd::encode_all(&bytes[..], 3).unwrap(),
+        _ => bytes,
+    }
 }
 
 fn write(page: &Page, path: &Path) {
@@ -199,7 +203,9 @@ fn tiles_that_stick_out_of_the_page_are_read() {
         let predictors: &[u16] = if dtype.is_float() { &[1, 2, 3] } else { &[1, 2] };
         for &predictor in predictors {
             for (height, width) in [(32, 32), (20, 33), (33, 47), (16, 17), (5, 7), (31, 1)] {
-                for (tile, compression) in [([16, 16], 5), ([16, 48], 5), ([32, 16], 1), ([96, 128], 5)] {
+                for (tile, compression) in
+                    [([16, 16], 5), ([16, 48], 5), ([32, 16], 1), ([96, 128], 5), ([16, 32], 50000)]
+                {
                     let page = Page { dtype, width, height, tile, compression, predictor, ..PAGE };
                     let what =
                         format!("{width} x {height} {dtype}, tiles {tile:?}, {compression}, predictor {predictor}");

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::spool::Packing;
 
 /// What a message about a codec ends with.
-pub const READ: &str = "; codecs that are read: blosc, zstd, gzip, zlib, lz4 and bz2 of numcodecs, crc32c, adler32, fletcher32, \
+pub const READ: &str = "; codecs that are read: blosc, zstd, gzip, zlib, lz4 and bz2 of numcodecs, crc32c of Zarr v3, adler32, fletcher32, \
      shuffle, transpose and shards of them";
 
 /// The outermost codec of a chunk, where it is unpacked here.
