@@ -50,14 +50,19 @@ fn main() {
         }
         for (sigma, moment) in [1, 3, 10].into_iter().flat_map(|s| [(s, "mean"), (s, "variance")]) {
             let variance = moment == "variance";
-            row(format!("gaussian sigma {sigma} {moment}"), &|| gaussian_job(dtype, sigma as f64, variance, false));
+            row(format!("gaussian sigma {sigma} {moment}"), &|| gaussian_job(dtype, sigma as f64, variance));
             if dtype == DType::F32 {
-                row(format!("gaussian sigma {sigma} {moment} gaps"), &|| {
-                    gaussian_job(dtype, sigma as f64, variance, true)
-                });
+                for gaps in GAPS {
+                    row(format!("gaussian sigma {sigma} {moment}, {gaps:?} gaps"), &|| {
+                        gaussian_job(dtype, sigma as f64, variance).with(gaps)
+                    });
+                }
             }
         }
         row("occlusion map, base and chain".into(), &|| chain_job(dtype));
+        for gaps in GAPS.iter().filter(|_| dtype == DType::F32) {
+            row(format!("occlusion map, {gaps:?} gaps"), &|| chain_job(dtype).with(*gaps));
+        }
         for size in [3, 5] {
             row(format!("gradient {size}^3 magnitude"), &|| gradient_job(dtype, size));
             for gaps in GAPS.iter().filter(|_| dtype == DType::F32) {
@@ -248,18 +253,13 @@ fn power_job<'a>(dtype: DType, radius: usize) -> Job<'a> {
     })
 }
 
-/// `gaps`: every hundredth voxel is missing.
-fn gaussian_job<'a>(dtype: DType, sigma: f64, variance: bool, gaps: bool) -> Job<'a> {
+fn gaussian_job<'a>(dtype: DType, sigma: f64, variance: bool) -> Job<'a> {
     let sigma = [sigma; 3];
-    let mut job = Job::new(dtype, reach(sigma), move |src, at, out, cx| {
+    Job::new(dtype, reach(sigma), move |src, at, out, cx| {
         let out = Some(out.view_mut(BOX));
         let (mean, variance) = if variance { (None, out) } else { (out, None) };
         gaussian(src, sigma, Affine::IDENTITY, None, at, mean, variance, cx);
-    });
-    if let (true, Voxels::F32(v)) = (gaps, &mut job.src.0) {
-        v.iter_mut().step_by(101).for_each(|v| *v = f32::NAN);
-    }
-    job
+    })
 }
 
 /// Every level of the map of the box, from its data; the last level's moments stand at the front of the result.
