@@ -181,6 +181,7 @@ fn pivot<V: F64x8, const H: usize>(value: &[[V; 5]; 5], there: &[[V; 5]; 5]) -> 
 /// Sums and differences of rows that mirror each other, along y and then z: the sum of rows H + d and H - d stands at H + d,
 /// their difference at H - d.
 #[inline(always)]
+#[allow(clippy::needless_range_loop)] // two rows at a time
 fn fold<V: F64x8, const H: usize>(rows: &mut [[V; 5]; 5]) {
     for row in rows.iter_mut().take(2 * H + 1) {
         for d in 1..=H {

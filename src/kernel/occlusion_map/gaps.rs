@@ -139,6 +139,7 @@ on_lanes! {
 const FIELDS: usize = 3;
 
 #[inline(always)]
+#[allow(clippy::needless_range_loop)] // places in the block, whatever is there
 fn pool_block_inner<V: F64x8>(block: &Block, out: &mut [f64; 2]) {
     let zero = V::splat(0.0);
     let pivot = V::splat(block.pivot);
