@@ -50,16 +50,24 @@ fn main() {
         }
         for (sigma, moment) in [1, 3, 10].into_iter().flat_map(|s| [(s, "mean"), (s, "variance")]) {
             let variance = moment == "variance";
-            row(format!("gaussian sigma {sigma} {moment}"), &|| gaussian_job(dtype, sigma as f64, variance, false));
+            row(format!("gaussian sigma {sigma} {moment}"), &|| gaussian_job(dtype, sigma as f64, variance));
             if dtype == DType::F32 {
-                row(format!("gaussian sigma {sigma} {moment} gaps"), &|| {
-                    gaussian_job(dtype, sigma as f64, variance, true)
-                });
+                for gaps in GAPS {
+                    row(format!("gaussian sigma {sigma} {moment}, {gaps:?} gaps"), &|| {
+                        gaussian_job(dtype, sigma as f64, variance).with(gaps)
+                    });
+                }
             }
         }
         row("occlusion map, base and chain".into(), &|| chain_job(dtype));
+        for gaps in GAPS.iter().filter(|_| dtype == DType::F32) {
+            row(format!("occlusion map, {gaps:?} gaps"), &|| chain_job(dtype).with(*gaps));
+        }
         for size in [3, 5] {
             row(format!("gradient {size}^3 magnitude"), &|| gradient_job(dtype, size));
+            for gaps in GAPS.iter().filter(|_| dtype == DType::F32) {
+                row(format!("gradient {size}^3 magnitude, {gaps:?} gaps"), &|| gradient_job(dtype, size).with(*gaps));
+            }
         }
     }
 }
@@ -126,6 +134,33 @@ fn field(dtype: DType, reach: [usize; 3]) -> (Voxels, Shape) {
 /// Source, place of the output box in it, output, level and scratch.
 type Kernel<'a> = dyn FnMut(AnyView, [usize; 3], &mut Voxels, &mut Context) + 'a;
 
+/// Which voxels of a source are missing.
+#[derive(Clone, Copy, Debug)]
+enum Gaps {
+    /// All outside of the ellipsoid that fills the box: a brain mask, a field of view.
+    Ball,
+    /// One of a hundred, at random.
+    Few,
+    /// Three of ten, at random.
+    Many,
+}
+
+const GAPS: [Gaps; 3] = [Gaps::Ball, Gaps::Few, Gaps::Many];
+
+impl Gaps {
+    fn holds(self, [z, y, x]: [usize; 3], shape: Shape, random: u64) -> bool {
+        let along = |i: usize, n: usize| (2.0 * i as f64 + 1.0) / n as f64 - 1.0;
+        match self {
+            Gaps::Ball => {
+                let [z, y, x] = [along(z, shape[0]), along(y, shape[1]), along(x, shape[2])];
+                z * z + y * y + x * x > 1.0
+            }
+            Gaps::Few => random % 1000 < 10,
+            Gaps::Many => random % 1000 < 300,
+        }
+    }
+}
+
 /// One timed kernel: its source, its buffers, and the call.
 struct Job<'a> {
     src: (Voxels, Shape),
@@ -143,6 +178,20 @@ impl<'a> Job<'a> {
     ) -> Job<'a> {
         let out = Voxels::zeroed(dtype.result(), BOX.iter().product());
         Job { src: field(dtype, reach), reach, out, scratch: Scratch::new(), kernel: Box::new(kernel) }
+    }
+
+    /// The same with missing voxels, where the source is f32.
+    fn with(mut self, gaps: Gaps) -> Job<'a> {
+        let (Voxels::F32(voxels), shape) = (&mut self.src.0, self.src.1) else { return self };
+        let mut state = 99u64;
+        for (i, v) in voxels.iter_mut().enumerate() {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            let at = [i / (shape[1] * shape[2]), i / shape[2] % shape[1], i % shape[2]];
+            if gaps.holds(at, shape, state >> 33) {
+                *v = f32::NAN;
+            }
+        }
+        self
     }
 
     fn run(&mut self, level: Level) {
@@ -204,18 +253,13 @@ fn power_job<'a>(dtype: DType, radius: usize) -> Job<'a> {
     })
 }
 
-/// `gaps`: every hundredth voxel is missing.
-fn gaussian_job<'a>(dtype: DType, sigma: f64, variance: bool, gaps: bool) -> Job<'a> {
+fn gaussian_job<'a>(dtype: DType, sigma: f64, variance: bool) -> Job<'a> {
     let sigma = [sigma; 3];
-    let mut job = Job::new(dtype, reach(sigma), move |src, at, out, cx| {
+    Job::new(dtype, reach(sigma), move |src, at, out, cx| {
         let out = Some(out.view_mut(BOX));
         let (mean, variance) = if variance { (None, out) } else { (out, None) };
         gaussian(src, sigma, Affine::IDENTITY, None, at, mean, variance, cx);
-    });
-    if let (true, Voxels::F32(v)) = (gaps, &mut job.src.0) {
-        v.iter_mut().step_by(101).for_each(|v| *v = f32::NAN);
-    }
-    job
+    })
 }
 
 /// Every level of the map of the box, from its data; the last level's moments stand at the front of the result.

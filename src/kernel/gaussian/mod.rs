@@ -5,17 +5,20 @@
 //! and variances pooled (variances plus spread of means), so constants give exactly themselves and 0, and nothing cancels.
 //!
 //! Results that are not finite (a missing voxel, an infinity or an overflow in the window) are computed once more by passes
-//! that carry each cell's weight, which is the normalised convolution over the voxels that are left. Which of the two a
-//! voxel gets depends on its window alone.
+//! that carry each cell's weight, which is the normalised convolution over the voxels that are left: only those rows, and the
+//! planes that their windows see. Which of the two a voxel gets depends on its window alone.
 
 mod rows;
 pub mod shared;
 mod taps;
 mod tiles;
+mod tiling;
 
 use super::Context;
+use crate::brick::scratch::{cut, padded};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Shape};
-use tiles::{Job, Out, Pass, Tiling};
+use tiles::{Job, Out, Pass};
+use tiling::{Tiling, Wanted};
 
 /// Separable Gaussian of `sigma` voxels per axis, truncated at `ceil(3 sigma)`, weights renormalised to the voxels that
 /// exist (inside `src`, not NaN, not `missing`). `mean` and `variance` have `src.dtype().result()`, or `mean` f64; scaled by `affine`. A
@@ -43,20 +46,21 @@ pub fn gaussian(
     }
     let job = Job { src, missing, affine, at, dst, radius: radius(sigma, from), sigma, level: cx.level };
     let bytes = cx.scratch.take(scratch_bytes(src.dtype(), from, dst, sigma, true));
-    let mut finite = true;
+    let (flags, bytes) = cut::<u8>(bytes, Wanted::len(dst));
+    let wanted = &mut Wanted::new(flags, dst);
     if src.dtype().result() == DType::F32 && !mean.as_ref().is_some_and(|m| m.dtype() == DType::F64) {
         if let Some(mean) = &mut mean {
-            finite &= job.run::<f32>(bytes, Pass::Mean, Out { mean: Some(mean), variance: None });
+            job.run::<f32>(bytes, Pass::Mean, Out { mean: Some(mean), variance: None }, wanted);
         }
         if let Some(variance) = &mut variance {
-            finite &= job.run::<f64>(bytes, Pass::Variance, Out { mean: None, variance: Some(variance) });
+            job.run::<f64>(bytes, Pass::Variance, Out { mean: None, variance: Some(variance) }, wanted);
         }
     } else {
         let pass = if variance.is_some() { Pass::Variance } else { Pass::Mean };
-        finite &= job.run::<f64>(bytes, pass, Out { mean: mean.as_mut(), variance: variance.as_mut() });
+        job.run::<f64>(bytes, pass, Out { mean: mean.as_mut(), variance: variance.as_mut() }, wanted);
     }
-    if !finite {
-        job.run::<f64>(bytes, Pass::Gaps, Out { mean: mean.as_mut(), variance: variance.as_mut() });
+    if wanted.any() {
+        job.mend(bytes, Out { mean: mean.as_mut(), variance: variance.as_mut() }, wanted);
     }
 }
 
@@ -71,7 +75,7 @@ pub fn scratch_bytes(_dtype: DType, src: Shape, dst: Shape, sigma: [f64; 3], _va
     let bytes = |fields: usize| Tiling::new(src, dst, radius, fields * size_of::<f64>()).bytes::<f64>(fields);
     let single = Tiling::new(src, dst, radius, size_of::<f32>()).bytes::<f32>(1);
     // mean, variance and weight: where voxels are missing, all three are carried
-    single.max(bytes(2)).max(bytes(3))
+    padded::<u8>(Wanted::len(dst)) + single.max(bytes(2)).max(bytes(3))
 }
 
 /// Half-widths, no larger than the source.

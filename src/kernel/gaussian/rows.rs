@@ -216,33 +216,50 @@ pub(super) struct Pooled<'a> {
 }
 
 /// Pools the taps by their own weights times those of the pass, as [`moment_row`] does, relative to the centre where it is
-/// valid, else to the nearest tap that is. Where that is not finite (an infinity, an overflow), by [`pool_one`].
+/// valid, else to the nearest tap that is. What is not finite then (an infinity, an overflow) is made by [`pool_one`]. Without
+/// variances (empty) means are the same.
 ///
 /// Panics if the taps leave the buffer or the row is no multiple of [`LANES`].
 pub(super) fn pool_row(level: Level, from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3]) {
-    let n = out[0].len();
-    let whole = n.is_multiple_of(LANES) && out.iter().all(|o| o.len() == n);
-    let alike = [from.variance.len(), from.weight.len()] == [from.mean.len(); 2];
-    assert!(whole && alike && taps.inside(n, from.mean.len()), "taps inside the buffer");
     let [mean, variance, weight] = out;
+    let n = mean.len();
+    let spread = !from.variance.is_empty();
+    let whole = n.is_multiple_of(LANES) && weight.len() == n && variance.len() == if spread { n } else { 0 };
+    let len = from.mean.len();
+    let alike = from.weight.len() == len && from.variance.len() == if spread { len } else { 0 };
+    assert!(whole && alike && taps.inside(n, len), "taps inside the buffer");
     let mut finite = true;
-    pooled(level, from, taps, [&mut *mean, &mut *variance, &mut *weight], &mut finite);
-    if !finite {
-        for i in 0..n {
-            if !(mean[i].is_finite() && variance[i].is_finite()) {
-                (mean[i], variance[i], weight[i]) = pool_one(&from, taps, i);
+    let to = [&mut *mean, &mut *variance, &mut *weight];
+    if spread {
+        pooled::<true>(level, from, taps, to, &mut finite);
+    } else {
+        pooled::<false>(level, from, taps, to, &mut finite);
+    }
+    if finite {
+        return;
+    }
+    for i in 0..n {
+        let (good, apart) = (mean[i].is_finite(), variance.get(i).is_some_and(|v| !v.is_finite()));
+        if !good || apart {
+            let (m, v, w) = pool_one(&from, taps, i);
+            if !good {
+                (mean[i], weight[i]) = (m, w);
+            }
+            if spread {
+                variance[i] = v;
             }
         }
     }
 }
 
 on_lanes! {
-    /// `finite` says whether all is.
-    fn pooled[](from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], finite: &mut bool) = pooled_inner[];
+    /// `finite` says whether all is; `SPREAD`: with variances.
+    fn pooled[const SPREAD: bool](from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], finite: &mut bool)
+        = pooled_inner[SPREAD];
 }
 
 #[inline(always)]
-fn pooled_inner<V: F64x8>(from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], finite: &mut bool) {
+fn pooled_inner<V: F64x8, const SPREAD: bool>(from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], finite: &mut bool) {
     let [mean, variance, weight] = out;
     let zero = V::splat(0.0);
     let mut blank = zero;
@@ -252,24 +269,28 @@ fn pooled_inner<V: F64x8>(from: Pooled, taps: &Taps<f64>, out: [&mut [f64]; 3], 
         let own = cells.weight(taps.centre);
         let c = cells.pivot(taps, own);
         let mut sums = [zero; 3];
-        cells.add(taps.centre, taps.weights[0], c, &mut sums);
+        cells.add::<SPREAD>(taps.centre, taps.weights[0], c, &mut sums);
         for (&[left, right], &w) in taps.pairs.iter().zip(&taps.weights[1..]) {
-            cells.add(left as usize, w, c, &mut sums);
-            cells.add(right as usize, w, c, &mut sums);
+            cells.add::<SPREAD>(left as usize, w, c, &mut sums);
+            cells.add::<SPREAD>(right as usize, w, c, &mut sums);
         }
         for (&[place, _], &w) in taps.singles.iter().zip(&taps.weights[1 + taps.pairs.len()..]) {
-            cells.add(place as usize, w, c, &mut sums);
+            cells.add::<SPREAD>(place as usize, w, c, &mut sums);
         }
         let [total, s, q] = sums;
         let s = s.over(total).where_positive(total);
-        let spread = not_below_zero(s.less(s, q.over(total))).where_positive(total);
         let m = c.plus(s).where_positive(total);
-        blank = blank.plus(m.minus(m)).plus(spread.minus(spread));
+        blank = blank.plus(m.minus(m));
         // SAFETY: as above.
         unsafe {
             m.store(mean.as_mut_ptr().add(i));
-            spread.store(variance.as_mut_ptr().add(i));
             total.store(weight.as_mut_ptr().add(i));
+        }
+        if SPREAD {
+            let spread = not_below_zero(s.less(s, q.over(total))).where_positive(total);
+            blank = blank.plus(spread.minus(spread));
+            // SAFETY: as above.
+            unsafe { spread.store(variance.as_mut_ptr().add(i)) };
         }
     }
     let mut sum = [0.0; 8];
@@ -293,8 +314,8 @@ impl<V: F64x8> Cells<V> {
     /// Places given to the methods have eight values from `i` on.
     #[inline(always)]
     unsafe fn after(from: &Pooled, i: usize) -> Cells<V> {
-        // SAFETY: the caller's promise.
-        let [mean, variance, weight] = [from.mean, from.variance, from.weight].map(|f| unsafe { f.as_ptr().add(i) });
+        // variances may be empty, and are not read then
+        let [mean, variance, weight] = [from.mean, from.variance, from.weight].map(|f| f.as_ptr().wrapping_add(i));
         Cells { mean, variance, weight, lanes: std::marker::PhantomData }
     }
 
@@ -328,16 +349,18 @@ impl<V: F64x8> Cells<V> {
         centre.choose(own, pivot)
     }
 
-    /// Adds a tap of weight `w` to the sums of weights, of weighted means from `c` on, and of weighted squares.
+    /// Adds a tap of weight `w` to the sums of weights, of weighted means from `c` on, and, where `SPREAD`, of weighted squares.
     #[inline(always)]
-    fn add(&self, place: usize, w: f64, c: V, sums: &mut [V; 3]) {
+    fn add<const SPREAD: bool>(&self, place: usize, w: f64, c: V, sums: &mut [V; 3]) {
         let share = V::splat(w).times(self.weight(place));
         let away = self.mean(place).minus(c);
-        // SAFETY: the promise of `after`.
-        let own = unsafe { V::load(self.variance.add(place)) };
         sums[0] = sums[0].plus(share);
         sums[1] = share.fused(away, sums[1]);
-        sums[2] = share.fused(away.fused(away, own), sums[2]);
+        if SPREAD {
+            // SAFETY: the promise of `after`.
+            let own = unsafe { V::load(self.variance.add(place)) };
+            sums[2] = share.fused(away.fused(away, own), sums[2]);
+        }
     }
 }
 
@@ -350,7 +373,7 @@ fn pool_one(from: &Pooled, taps: &Taps<f64>, i: usize) -> (f64, f64, f64) {
             let at = place as usize + i;
             let w = w * from.weight[at];
             if w > 0.0 {
-                f(w, from.mean[at], from.variance[at]);
+                f(w, from.mean[at], from.variance.get(at).copied().unwrap_or(0.0));
             }
         };
         for (pair, w) in taps.pairs.iter().zip(&taps.weights[1..]) {
@@ -396,4 +419,43 @@ fn store_inner<F: Real, D: Real>(row: &[F], a: f64, b: f64, dst: &mut [D]) -> bo
         *d = D::narrow(if good { a * v + b } else { f64::NAN });
     }
     finite
+}
+
+multiversion! {
+    /// Whether a result is NaN whose centre is not missing.
+    pub(super) fn any_lost[T: Voxel, D: Real](centres: &[T], missing: Option<i64>, dst: &[D]) -> bool = any_lost_inner;
+}
+
+#[inline(always)]
+fn any_lost_inner<T: Voxel, D: Real>(centres: &[T], missing: Option<i64>, dst: &[D]) -> bool {
+    let missing = missing_as::<T>(missing);
+    centres.iter().zip(dst).fold(false, |lost, (c, d)| lost | (d.to_f64().is_nan() & is_there(*c, missing)))
+}
+
+#[inline(always)]
+fn is_there<T: Voxel>(v: T, missing: Option<T>) -> bool {
+    missing != Some(v) && !v.to_f64().is_nan()
+}
+
+multiversion! {
+    /// Stores `a v + b`, rounded once, where a result is NaN, its centre is not missing, and its weight above 0; `from` are v
+    /// and weights.
+    pub(super) fn fill_row[T: Voxel, F: Real, D: Real](
+        centres: &[T], missing: Option<i64>, from: [&[F]; 2], scale: [f64; 2], dst: &mut [D],
+    ) -> () = fill_inner;
+}
+
+#[inline(always)]
+fn fill_inner<T: Voxel, F: Real, D: Real>(
+    centres: &[T],
+    missing: Option<i64>,
+    [row, weight]: [&[F]; 2],
+    [a, b]: [f64; 2],
+    dst: &mut [D],
+) {
+    let missing = missing_as::<T>(missing);
+    for (((d, c), v), w) in dst.iter_mut().zip(centres).zip(row).zip(weight) {
+        let fill = d.to_f64().is_nan() & is_there(*c, missing) & (w.to_f64() > 0.0);
+        *d = if fill { D::narrow(a * v.to_f64() + b) } else { *d };
+    }
 }

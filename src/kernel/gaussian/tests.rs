@@ -149,6 +149,40 @@ fn constants_are_exact_also_beside_missing_voxels() {
 }
 
 #[test]
+fn rows_far_apart_are_mended_alone_and_means_are_the_same_without_variances() {
+    let (shape, sigma) = ([37, 20, 150], [0.6, 1.0, 1.2]);
+    let mut v = calm(DType::F32, shape, 4);
+    let at = |[z, y, x]: [usize; 3]| (z * shape[1] + y) * shape[2] + x;
+    crate::with_voxels!(&mut v, v => {
+        for (place, value) in [
+            ([2, 3, 5], f64::NAN), ([3, 18, 140], f64::NAN), ([20, 9, 70], f64::NAN), ([21, 9, 70], f64::NAN),
+            ([30, 2, 63], f64::INFINITY), ([30, 3, 64], f64::NAN), ([36, 19, 149], f64::NAN), ([10, 10, 10], 3e38),
+        ] {
+            v[at(place)] = crate::grid::Voxel::from_f64(value);
+        }
+    });
+    let expect = reference(&v, shape, sigma, None);
+    let got = bricks(&v, shape, sigma, Affine::IDENTITY, None, 1000, Level::detect());
+    for (i, e) in expect.iter().enumerate() {
+        let variance = if e[1] > 1e38 { f64::INFINITY } else { e[1] };
+        assert!(near(got[0][i], e[0], 5e-7, 1e-4) && near(got[1][i], variance, 1e-6, 1e-20), "voxel {i}: {e:?}");
+    }
+    let mut mean = Voxels::zeroed(DType::F32, v.len());
+    let mut scratch = Scratch::new();
+    for (level, edge) in Level::available().into_iter().map(|l| (l, 1000)).chain([(Level::detect(), 11)]) {
+        let other = bricks(&v, shape, sigma, Affine::IDENTITY, None, edge, level);
+        let mut cx = Context { level, scratch: &mut scratch };
+        let alone = Some(mean.view_mut(shape));
+        gaussian(v.view(shape), sigma, Affine::IDENTITY, None, [0; 3], alone, None, &mut cx);
+        for i in 0..v.len() {
+            let same = |a: f64, b: f64| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan();
+            assert!(same(got[0][i], other[0][i]) && same(got[1][i], other[1][i]), "{level:?} {edge} voxel {i}");
+            assert!(same(got[0][i], mean.at(i)), "{level:?} voxel {i}: the mean alone is {}", mean.at(i));
+        }
+    }
+}
+
+#[test]
 fn variance_holds_where_the_mean_is_a_million_times_larger() {
     let shape = [7, 8, 64];
     let mut noise = Noise(8);

@@ -3,12 +3,12 @@
 
 use std::ops::Range;
 
-use super::rows::{LANES, Pooled, Real, load_row, mean_row, moment_row, pool_row, store_row};
+use super::rows::{Pooled, Real, any_lost, fill_row, load_row, mean_row, moment_row, pool_row, store_row};
 use super::taps::{Edges, Table, Taps, bell};
-use crate::brick::scratch::{cut, padded};
-use crate::grid::{Affine, AnyView, AnyViewMut, Shape, Voxel};
+use super::tiling::{Tile, Tiling, WIDTH, Wanted};
+use crate::brick::scratch::cut;
+use crate::grid::{Affine, AnyView, AnyViewMut, Shape};
 use crate::kernel::simd::Level;
-use crate::kernel::values::{load_any, store_any};
 use crate::with_view;
 
 /// What a run of the passes carries.
@@ -17,18 +17,23 @@ pub(super) enum Pass {
     Mean,
     /// Mean and variance.
     Variance,
-    /// Mean, variance and weight; writes only voxels that an earlier run left NaN.
+    /// Mean and weight; writes only voxels that an earlier run left NaN.
+    GapMeans,
+    /// Mean, variance and weight, likewise.
     Gaps,
 }
 
 impl Pass {
-    /// Numbers of a cell.
-    fn fields(self) -> usize {
-        match self {
-            Pass::Mean => 1,
-            Pass::Variance => 2,
-            Pass::Gaps => 3,
-        }
+    /// Which of mean, variance and weight a cell has, in `F`.
+    fn carries<F>(self) -> [bool; 3] {
+        // a mean in f64 is made as a moment, beside its variance
+        let moment = self == Pass::Mean && size_of::<F>() == size_of::<f64>();
+        [true, moment || matches!(self, Pass::Variance | Pass::Gaps), self.counts()]
+    }
+
+    /// Whether cells may be missing.
+    fn counts(self) -> bool {
+        matches!(self, Pass::GapMeans | Pass::Gaps)
     }
 }
 
@@ -43,72 +48,6 @@ pub(super) struct Job<'a> {
     pub level: Level,
 }
 
-/// Voxels of a tile along x.
-const WIDTH: usize = 64;
-/// Bytes that the planes between the passes along y and z take, where that leaves rows enough.
-const RING_BYTES: usize = 512 << 10;
-/// Least rows of a tile for each that its windows add at both sides.
-const ROWS_PER_HALO: usize = 1;
-
-/// Elements after which addresses meet in the sets of a first-level cache: a page of f32, two of f64.
-const PAGE: usize = 1024;
-
-/// How the output box is cut, and what a tile holds between passes.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Tiling {
-    /// Lanes of a row.
-    width: usize,
-    rows: usize,
-    /// Planes of results made together, so that each plane of the ring is read fewer times.
-    batch: usize,
-    /// Planes of the ring, and elements from one to the next.
-    slots: usize,
-    pitch: usize,
-    radius: [usize; 3],
-}
-
-impl Tiling {
-    /// `cell` is the size of all numbers of a cell.
-    pub fn new(src: Shape, dst: Shape, radius: [usize; 3], cell: usize) -> Tiling {
-        let width = dst[2].min(WIDTH).next_multiple_of(LANES);
-        let batch = radius[0].clamp(4, 16).min(dst[0]);
-        let slots = (2 * radius[0] + batch).min(src[0]);
-        let fit = RING_BYTES / (slots * width * cell);
-        let rows = fit.max(2 * radius[1] * ROWS_PER_HALO).max(8).min(dst[1]);
-        // tiles of one height
-        let rows = dst[1].div_ceil(dst[1].div_ceil(rows));
-        // the same row of all planes falls into sets of its own in the first-level cache
-        let pitch = (rows * width).next_multiple_of(PAGE) + width;
-        Tiling { width, rows, batch, slots, pitch, radius }
-    }
-
-    /// Lanes before the first of a source row, and of all of it.
-    fn row(&self) -> [usize; 2] {
-        let margin = self.radius[2].next_multiple_of(LANES);
-        [margin, margin + self.width + self.radius[2].next_multiple_of(LANES)]
-    }
-
-    /// Elements of a field's buffers: a source row, a plane after the pass along x, the ring after that along y, a row of
-    /// results.
-    fn field(&self) -> [usize; 4] {
-        [self.row()[1], (self.rows + 2 * self.radius[1]) * self.width, self.slots * self.pitch, self.width]
-    }
-
-    /// Bytes of scratch for `fields` numbers of `F` in a cell.
-    pub fn bytes<F>(&self, fields: usize) -> usize {
-        let table = |axis: usize, entries: usize| {
-            let r = self.radius[axis];
-            padded::<f64>(r + 1)
-                + padded::<F>(entries * (r + 1))
-                + padded::<u32>(2 * entries * r)
-                + padded::<u32>(2 * entries)
-        };
-        let edges = padded::<F>((self.radius[2] + 1) * self.width) + 2 * padded::<F>(self.width);
-        let tables = table(2, 1) + table(1, self.rows) + table(0, self.batch);
-        fields * self.field().into_iter().map(padded::<F>).sum::<usize>() + tables + edges
-    }
-}
-
 /// Buffers of one number of a cell; see [`Tiling::field`].
 struct Field<'a, F> {
     row: &'a mut [F],
@@ -117,25 +56,10 @@ struct Field<'a, F> {
     out: &'a mut [F],
 }
 
-/// Buffers of a run.
-struct Work<'a, F> {
-    /// Along z, y, x.
-    tables: [Table<'a, F>; 3],
-    edges: Edges<'a, F>,
-    /// Mean, variance, weight; those that the pass does not carry are empty.
-    fields: [Field<'a, F>; 3],
-}
-
 /// What is asked for.
 pub(super) struct Out<'a, 'm, 'v> {
     pub mean: Option<&'a mut AnyViewMut<'m>>,
     pub variance: Option<&'a mut AnyViewMut<'v>>,
-}
-
-/// A tile: its outputs along y and x.
-struct Tile {
-    y: Range<usize>,
-    x: Range<usize>,
 }
 
 /// A pass over one row, in `F`: `from` are buffers of mean, variance, weight; `first` says that cells have no variance yet.
@@ -179,7 +103,7 @@ impl Passes for f64 {
             Pass::Mean | Pass::Variance => {
                 moment_row(level, [from[0], from[1]], !first, taps, edges, [mean, variance]);
             }
-            Pass::Gaps => {
+            Pass::GapMeans | Pass::Gaps => {
                 let from = Pooled { mean: from[0], variance: from[1], weight: from[2] };
                 pool_row(level, from, taps, [mean, variance, weight]);
             }
@@ -188,65 +112,41 @@ impl Passes for f64 {
 }
 
 impl Job<'_> {
-    /// Runs the passes and writes what is asked for; returns whether every result is finite.
-    pub fn run<F: Passes>(&self, bytes: &mut [u8], pass: Pass, mut out: Out) -> bool {
-        let tiling = self.tiling::<F>(pass);
-        let mut work = self.carve::<F>(bytes, &tiling, fields_of::<F>(pass));
-        let [_, ny, nx] = self.dst;
-        let mut finite = true;
-        for x in (0..nx).step_by(WIDTH) {
-            for y in (0..ny).step_by(tiling.rows) {
-                let tile = Tile { y: y..(y + tiling.rows).min(ny), x: x..(x + WIDTH).min(nx) };
-                finite &= self.tile(&tile, &tiling, pass, &mut work, &mut out);
-            }
+    /// Runs the passes and writes what is asked for; adds rows to `wanted` where a result is not finite though its centre is
+    /// there.
+    pub fn run<F: Passes>(&self, bytes: &mut [u8], pass: Pass, mut out: Out, wanted: &mut Wanted) {
+        let mut run = self.start::<F>(bytes, pass);
+        for tile in self.tiles(run.tiling.rows) {
+            run.tile(&tile, &mut out, wanted);
         }
-        finite
     }
 
-    fn tiling<F>(&self, pass: Pass) -> Tiling {
-        Tiling::new(self.src.shape(), self.dst, self.radius, fields_of::<F>(pass) * size_of::<F>())
-    }
-
-    fn tile<F: Passes>(&self, tile: &Tile, tiling: &Tiling, pass: Pass, work: &mut Work<F>, out: &mut Out) -> bool {
-        let (src, r) = (self.src.shape(), self.radius);
-        let needed = |a: usize, out: Range<usize>| {
-            (self.at[a] + out.start).saturating_sub(r[a])..(self.at[a] + out.end + r[a]).min(src[a])
-        };
-        let (planes, rows) = (needed(0, 0..self.dst[0]), needed(1, tile.y.clone()));
-        let width = tiling.width;
-        for (i, y) in tile.y.clone().enumerate() {
-            work.tables[1].set(i, self.at[1] + y, src[1], |q| (q - rows.start) * width);
-        }
-        let edge = self.along_x_at(tile, tiling, work);
-        let (mut done, mut finite) = (0, true);
-        for sz in planes.clone() {
-            for (i, sy) in rows.clone().enumerate() {
-                self.load(pass, [sz, sy], needed(2, tile.x.clone()), tile, tiling, work);
-                self.along_x(pass, i, edge, tiling, work);
-            }
-            self.along_y(pass, sz % tiling.slots, tile, tiling, work);
-            // outputs whose windows are complete
-            let ready = if sz + 1 == src[0] {
-                self.dst[0]
-            } else {
-                (sz + 1).saturating_sub(self.at[0] + r[0]).min(self.dst[0])
-            };
-            if ready - done == tiling.batch || sz + 1 == planes.end {
-                finite &= self.along_z(pass, done..ready, tile, tiling, work, out);
-                done = ready;
+    /// Makes what is `wanted` once more, over the voxels that are not missing.
+    pub fn mend(&self, bytes: &mut [u8], mut out: Out, wanted: &mut Wanted) {
+        let pass = if out.variance.is_some() { Pass::Gaps } else { Pass::GapMeans };
+        let mut run = self.start::<f64>(bytes, pass);
+        for mut tile in self.tiles(run.tiling.rows) {
+            // a run of planes costs two half-widths of planes more
+            while let Some(part) = wanted.next(&tile, 2 * self.radius[0]) {
+                run.tile(&part, &mut out, wanted);
+                tile.z.start = part.z.end;
             }
         }
-        finite
     }
-}
 
-fn fields_of<F>(pass: Pass) -> usize {
-    // a mean in f64 is made as a moment, beside its variance
-    if size_of::<F>() == size_of::<f64>() { pass.fields().max(2) } else { 1 }
-}
+    /// The tiles of the output box.
+    fn tiles(&self, rows: usize) -> impl Iterator<Item = Tile> {
+        let [nz, ny, nx] = self.dst;
+        (0..nx).step_by(WIDTH).flat_map(move |x| {
+            let row = x..(x + WIDTH).min(nx);
+            (0..ny).step_by(rows).map(move |y| Tile { z: 0..nz, y: y..(y + rows).min(ny), x: row.clone() })
+        })
+    }
 
-impl Job<'_> {
-    fn carve<'b, F: Passes>(&self, bytes: &'b mut [u8], tiling: &Tiling, fields: usize) -> Work<'b, F> {
+    fn start<'b, F: Passes>(&self, bytes: &'b mut [u8], pass: Pass) -> Run<'_, 'b, F> {
+        let carries = pass.carries::<F>();
+        let cell = carries.iter().filter(|c| **c).count() * size_of::<F>();
+        let tiling = Tiling::new(self.src.shape(), self.dst, self.radius, cell);
         let mut rest = bytes;
         let tables = [(0, tiling.batch), (1, tiling.rows), (2, 1)].map(|(a, entries)| {
             let r = self.radius[a];
@@ -266,44 +166,83 @@ impl Job<'_> {
         };
         let weights = take((self.radius[2] + 1) * tiling.width);
         let edges = Edges { weights, room: [take(tiling.width), take(tiling.width)] };
-        let fields = std::array::from_fn(|i| {
-            let [row, plane, ring, out] = if i < fields { tiling.field() } else { [0; 4] }.map(&mut take);
+        let fields = carries.map(|carried| {
+            let [row, plane, ring, out] = if carried { tiling.field() } else { [0; 4] }.map(&mut take);
             Field { row, plane, ring, out }
         });
-        Work { tables, edges, fields }
+        Run { job: self, pass, tiling, tables, edges, fields }
+    }
+}
+
+/// A run of the passes: what it carries, how it is cut, and its buffers.
+struct Run<'j, 'b, F> {
+    job: &'j Job<'j>,
+    pass: Pass,
+    tiling: Tiling,
+    /// Along z, y, x.
+    tables: [Table<'b, F>; 3],
+    edges: Edges<'b, F>,
+    /// Mean, variance, weight; those that the pass does not carry are empty.
+    fields: [Field<'b, F>; 3],
+}
+
+impl<F: Passes> Run<'_, '_, F> {
+    /// What the windows of outputs see along an axis.
+    fn needed(&self, a: usize, out: &Range<usize>) -> Range<usize> {
+        let (at, r) = (self.job.at[a], self.job.radius[a]);
+        (at + out.start).saturating_sub(r)..(at + out.end + r).min(self.job.src.shape()[a])
+    }
+
+    fn tile(&mut self, tile: &Tile, out: &mut Out, wanted: &mut Wanted) {
+        let (src, at, r) = (self.job.src.shape(), self.job.at, self.job.radius);
+        let (planes, rows) = (self.needed(0, &tile.z), self.needed(1, &tile.y));
+        let width = self.tiling.width;
+        for (i, y) in tile.y.clone().enumerate() {
+            self.tables[1].set(i, at[1] + y, src[1], |q| (q - rows.start) * width);
+        }
+        let edge = self.along_x_at(tile);
+        let mut done = tile.z.start;
+        for sz in planes.clone() {
+            for (i, sy) in rows.clone().enumerate() {
+                self.load([sz, sy], tile);
+                self.along_x(i, edge);
+            }
+            self.along_y(sz % self.tiling.slots, tile);
+            // outputs whose windows are complete
+            let ready = if sz + 1 == src[0] { tile.z.end } else { (sz + 1).saturating_sub(at[0] + r[0]) };
+            let ready = ready.clamp(done, tile.z.end);
+            if ready - done == self.tiling.batch || sz + 1 == planes.end {
+                self.along_z(done..ready, tile, out, wanted);
+                done = ready;
+            }
+        }
     }
 
     /// Weights along x for the lanes of a tile; whether some of them see an end of the axis. Rows are cleared: what stands beyond an
     /// end has weight 0.
-    fn along_x_at<F: Passes>(&self, tile: &Tile, tiling: &Tiling, work: &mut Work<F>) -> bool {
-        let (n, r) = (self.src.shape()[2], self.radius[2]);
-        let [margin, _] = tiling.row();
-        let (first, last) = (self.at[2] + tile.x.start, self.at[2] + tile.x.end - 1);
+    fn along_x_at(&mut self, tile: &Tile) -> bool {
+        let (n, r) = (self.job.src.shape()[2], self.job.radius[2]);
+        let [margin, _] = self.tiling.row();
+        let (first, last) = (self.job.at[2] + tile.x.start, self.job.at[2] + tile.x.end - 1);
         // the taps of a voxel in the middle
-        work.tables[2].set(0, r, 2 * r + 1, |q| margin + q - r);
+        self.tables[2].set(0, r, 2 * r + 1, |q| margin + q - r);
         let edge = first < r || last + r >= n;
         if edge {
-            work.edges.set(first, n, work.tables[2].bell);
+            self.edges.set(first, n, self.tables[2].bell);
         }
-        work.fields.iter_mut().for_each(|f| f.row.fill(F::narrow(0.0)));
+        self.fields.iter_mut().for_each(|f| f.row.fill(F::narrow(0.0)));
         edge
     }
 
     /// Source row `[sz, sy]`; where gaps are counted, as mean, variance 0 and weight 1 or 0.
-    fn load<F: Passes>(
-        &self,
-        pass: Pass,
-        [sz, sy]: [usize; 2],
-        x: Range<usize>,
-        tile: &Tile,
-        tiling: &Tiling,
-        work: &mut Work<F>,
-    ) {
-        let start = tiling.row()[0] + x.start - (self.at[2] + tile.x.start);
-        let [mean, _, weight] = &mut work.fields;
+    fn load(&mut self, [sz, sy]: [usize; 2], tile: &Tile) {
+        let x = self.needed(2, &tile.x);
+        let start = self.tiling.row()[0] + x.start - (self.job.at[2] + tile.x.start);
+        let [mean, _, weight] = &mut self.fields;
         let row = &mut mean.row[start..start + x.len()];
-        with_view!(AnyView, self.src, v => load_row(self.level, &v.row_at(sz, sy)[x], self.missing, row));
-        if pass == Pass::Gaps {
+        let Job { src, missing, level, .. } = *self.job;
+        with_view!(AnyView, src, v => load_row(level, &v.row_at(sz, sy)[x], missing, row));
+        if self.pass.counts() {
             for (m, w) in row.iter_mut().zip(&mut weight.row[start..]) {
                 let gone = m.to_f64().is_nan();
                 *w = F::narrow(f64::from(!gone));
@@ -312,104 +251,103 @@ impl Job<'_> {
         }
     }
 
-    fn along_x<F: Passes>(&self, pass: Pass, row: usize, edge: bool, tiling: &Tiling, work: &mut Work<F>) {
-        let Work { tables, edges, fields: [a, b, c] } = work;
-        let taps = tables[2].taps(0, tiling.row()[0]);
+    fn along_x(&mut self, row: usize, edge: bool) {
+        let (width, [margin, _]) = (self.tiling.width, self.tiling.row());
+        let Run { tables, edges, fields: [a, b, c], .. } = self;
+        let taps = tables[2].taps(0, margin);
         // where gaps are counted, what does not exist has no weight
-        let edges = (edge && pass != Pass::Gaps).then_some(&*edges);
-        let to = row * tiling.width..(row + 1) * tiling.width;
+        let edges = (edge && !self.pass.counts()).then_some(&*edges);
+        let to = row * width..(row + 1) * width;
         let to = [&mut a.plane, &mut b.plane, &mut c.plane].map(|p| part_mut(p, to.clone()));
-        F::row(self.level, pass, [&*a.row, &*b.row, &*c.row], true, &taps, edges, to);
+        F::row(self.job.level, self.pass, [&*a.row, &*b.row, &*c.row], true, &taps, edges, to);
     }
 
-    fn along_y<F: Passes>(&self, pass: Pass, slot: usize, tile: &Tile, tiling: &Tiling, work: &mut Work<F>) {
-        let Work { tables, fields: [a, b, c], .. } = work;
-        let first = (self.at[1] + tile.y.start).min(self.radius[1]);
+    fn along_y(&mut self, slot: usize, tile: &Tile) {
+        let Tiling { width, pitch, .. } = self.tiling;
+        let first = (self.job.at[1] + tile.y.start).min(self.job.radius[1]);
+        let Run { tables, fields: [a, b, c], .. } = self;
         for y in 0..tile.y.len() {
-            let taps = tables[1].taps(y, (first + y) * tiling.width);
-            let start = slot * tiling.pitch + y * tiling.width;
-            let to = [&mut a.ring, &mut b.ring, &mut c.ring].map(|p| part_mut(p, start..start + tiling.width));
-            F::row(self.level, pass, [&*a.plane, &*b.plane, &*c.plane], false, &taps, None, to);
+            let taps = tables[1].taps(y, (first + y) * width);
+            let start = slot * pitch + y * width;
+            let to = [&mut a.ring, &mut b.ring, &mut c.ring].map(|p| part_mut(p, start..start + width));
+            F::row(self.job.level, self.pass, [&*a.plane, &*b.plane, &*c.plane], false, &taps, None, to);
         }
     }
 
     /// Planes `z` of results, whose windows are in the ring, row by row: what one row of windows reads stays close.
-    fn along_z<F: Passes>(
-        &self,
-        pass: Pass,
-        z: Range<usize>,
-        tile: &Tile,
-        tiling: &Tiling,
-        work: &mut Work<F>,
-        out: &mut Out,
-    ) -> bool {
-        let n = self.src.shape()[0];
-        let place = |q: usize| q % tiling.slots * tiling.pitch;
-        let mut finite = true;
-        for start in z.clone().step_by(tiling.batch) {
-            let batch = start..(start + tiling.batch).min(z.end);
+    fn along_z(&mut self, z: Range<usize>, tile: &Tile, out: &mut Out, wanted: &mut Wanted) {
+        let (n, at) = (self.job.src.shape()[0], self.job.at[0]);
+        let (level, pass) = (self.job.level, self.pass);
+        let Tiling { width, batch, slots, pitch, .. } = self.tiling;
+        let place = |q: usize| q % slots * pitch;
+        for start in z.clone().step_by(batch) {
+            let batch = start..(start + batch).min(z.end);
             for (i, z) in batch.clone().enumerate() {
-                work.tables[0].set(i, self.at[0] + z, n, place);
+                self.tables[0].set(i, at + z, n, place);
             }
             for y in 0..tile.y.len() {
                 for (i, z) in batch.clone().enumerate() {
-                    let Work { tables, fields: [a, b, c], .. } = &mut *work;
-                    let taps = tables[0].taps(i, place(self.at[0] + z));
-                    let from = [&a.ring, &b.ring, &c.ring].map(|r| r.get(y * tiling.width..).unwrap_or_default());
-                    F::row(self.level, pass, from, false, &taps, None, [&mut *a.out, &mut *b.out, &mut *c.out]);
-                    let (at, x) = ([z, tile.y.start + y], tile.x.clone());
-                    if let Some(dst) = &mut out.mean {
-                        finite &= self.write(pass, at, x.clone(), work, false, dst);
+                    let row = [z, tile.y.start + y];
+                    if self.pass.counts() && !wanted.holds(row, tile.x.start) {
+                        continue;
                     }
-                    if let Some(dst) = &mut out.variance {
-                        finite &= self.write(pass, at, x, work, true, dst);
-                    }
+                    let Run { tables, fields: [a, b, c], .. } = &mut *self;
+                    let taps = tables[0].taps(i, place(at + z));
+                    let from = [&a.ring, &b.ring, &c.ring].map(|r| r.get(y * width..).unwrap_or_default());
+                    let to = [&mut *a.out, &mut *b.out, &mut *c.out];
+                    F::row(level, pass, from, false, &taps, None, to);
+                    self.write(row, tile, out, wanted);
                 }
             }
         }
-        finite
     }
 
-    /// Scales and stores one row of means, or of variances (`squared`); returns whether it is finite. What is not becomes
-    /// NaN, which is what [`Pass::Gaps`] then writes over.
-    fn write<F: Passes>(
+    /// Scales and stores one row of what is asked for. What is not finite becomes NaN, which is what passes that count gaps
+    /// then write over.
+    fn write(&self, [z, y]: [usize; 2], tile: &Tile, out: &mut Out, wanted: &mut Wanted) {
+        let (a, b) = (self.job.affine.slope, self.job.affine.intercept);
+        let mut lost = false;
+        if let Some(dst) = &mut out.mean {
+            lost |= self.write_one([z, y], tile, 0, [a, b], dst);
+        }
+        if let Some(dst) = &mut out.variance {
+            lost |= self.write_one([z, y], tile, 1, [a * a, 0.0], dst);
+        }
+        if lost {
+            wanted.add([z, y], tile.x.start);
+        }
+    }
+
+    /// One row of one output from a field; whether a voxel is left NaN that is not missing.
+    fn write_one(&self, [z, y]: [usize; 2], tile: &Tile, field: usize, scale: [f64; 2], dst: &mut AnyViewMut) -> bool {
+        match dst {
+            AnyViewMut::F32(d) => self.write_row([z, y], tile, field, scale, &mut d.row_at(z, y)[tile.x.clone()]),
+            AnyViewMut::F64(d) => self.write_row([z, y], tile, field, scale, &mut d.row_at(z, y)[tile.x.clone()]),
+            other => panic!("a Gaussian moment is not {}", other.dtype()),
+        }
+    }
+
+    fn write_row<D: Real>(
         &self,
-        pass: Pass,
         [z, y]: [usize; 2],
-        x: Range<usize>,
-        work: &Work<F>,
-        squared: bool,
-        dst: &mut AnyViewMut,
+        tile: &Tile,
+        field: usize,
+        [a, b]: [f64; 2],
+        dst: &mut [D],
     ) -> bool {
-        let row = &work.fields[usize::from(squared)].out[..x.len()];
-        let (a, b) = (self.affine.slope, self.affine.intercept);
-        let (a, b) = if squared { (a * a, 0.0) } else { (a, b) };
-        match (pass, dst) {
-            (Pass::Gaps, dst) => {
-                let weight = &work.fields[2].out[..x.len()];
-                for ((x, v), w) in x.zip(row).zip(weight) {
-                    if w.to_f64() > 0.0 && is_nan_at(dst, [z, y, x]) && !self.is_missing([z, y, x]) {
-                        store_any(dst, [z, y, x], &[a * v.to_f64() + b]);
-                    }
-                }
-                true
-            }
-            (_, AnyViewMut::F32(d)) => store_row(self.level, row, a, b, &mut d.row_at(z, y)[x]),
-            (_, AnyViewMut::F64(d)) => store_row(self.level, row, a, b, &mut d.row_at(z, y)[x]),
-            (_, other) => panic!("a Gaussian moment is not {}", other.dtype()),
+        let Job { src, missing, level, at, .. } = *self.job;
+        let row = &self.fields[field].out[..dst.len()];
+        let x = at[2] + tile.x.start..at[2] + tile.x.end;
+        if self.pass.counts() {
+            let weight = &self.fields[2].out[..dst.len()];
+            with_view!(AnyView, src, v => {
+                fill_row(level, &v.row_at(at[0] + z, at[1] + y)[x], missing, [row, weight], [a, b], dst);
+            });
+            return false;
         }
+        let finite = store_row(level, row, a, b, dst);
+        !finite && with_view!(AnyView, src, v => any_lost(level, &v.row_at(at[0] + z, at[1] + y)[x], missing, dst))
     }
-
-    /// Whether the centre of an output voxel is missing.
-    fn is_missing(&self, [z, y, x]: [usize; 3]) -> bool {
-        let mut centre = [0.0];
-        load_any(&self.src, [self.at[0] + z, self.at[1] + y, self.at[2] + x], self.missing, &mut centre);
-        centre[0].is_nan()
-    }
-}
-
-fn is_nan_at(dst: &mut AnyViewMut, [z, y, x]: [usize; 3]) -> bool {
-    with_view!(AnyViewMut, dst, d => d.row_at(z, y)[x].to_f64().is_nan())
 }
 
 /// A part of a buffer; nothing of one that the pass does not carry.

@@ -6,12 +6,13 @@
 //! bits, which is exact), along x in registers. No fused operations: on a CPU that has them they save little here, and one
 //! that has not would pay fifty times over.
 
-mod regression;
+mod gaps;
 pub mod shared;
 
 use std::marker::PhantomData;
 
 use super::Context;
+use super::simd::Level;
 use super::values::missing_as;
 use crate::brick::scratch::{cut, padded};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Shape, View, Voxel};
@@ -62,7 +63,7 @@ pub fn gradient(
     let level = cx.level;
     macro_rules! run {
         ($half:literal, $sum:ty, $v:ident, $missing:expr) => {{
-            let job = Job::<$half, $sum> { shape, at, slope: affine.slope, table, sums: PhantomData };
+            let job = Job::<$half, $sum> { level, shape, at, slope: affine.slope, table, sums: PhantomData };
             planes(level, $v, $missing, &job, &mut out, scratch)
         }};
     }
@@ -90,6 +91,7 @@ const SUMS: usize = 8;
 
 /// What to do everywhere: `H` is the window's half-width, `S` what row sums are kept in.
 struct Job<'a, const H: usize, S> {
+    level: Level,
     shape: Shape,
     at: [usize; 3],
     slope: f64,
@@ -99,7 +101,6 @@ struct Job<'a, const H: usize, S> {
 
 /// Weights of one spacing, `H` = half-width.
 struct Table {
-    half: usize,
     /// `along[a][dz][dy][dx]`: weight of component a at offsets >= 0, divided by its denominator.
     along: [[[[f64; 3]; 3]; 3]; 3],
     /// Weight of a voxel by its offsets' magnitudes, for the full regression.
@@ -109,7 +110,7 @@ struct Table {
 
 impl Table {
     fn new(half: usize, weight: GradientWeight, spacing: [f64; 3]) -> Table {
-        let mut table = Table { half, along: Default::default(), weight: Default::default(), spacing };
+        let mut table = Table { along: Default::default(), weight: Default::default(), spacing };
         let mut below = [0.0; 3];
         let range = 0..=half;
         for [z, y, x] in range.clone().flat_map(|z| range.clone().flat_map(move |y| (0..=half).map(move |x| [z, y, x])))
@@ -196,6 +197,11 @@ fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
                 let n = RUN.min(job.shape[2] - x);
                 let m = n + 2 * H;
                 let centre = [job.at[0] + z, job.at[1] + y, job.at[2] + x];
+                if gaps && all_missing(&src.row_at(centre[0], centre[1])[centre[2]..][..n], missing) {
+                    parts.fill(f64::NAN);
+                    store([z, y, x], n, job.slope, parts, out);
+                    continue;
+                }
                 let rows: [[&[T]; 5]; 5] = std::array::from_fn(|dz| {
                     std::array::from_fn(|dy| {
                         let (dz, dy) = (dz.min(2 * H), dy.min(2 * H));
@@ -211,7 +217,7 @@ fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
                 }
                 join_columns::<H>(sums, parts);
                 if gaps && any_nan(&rows[H][H][H..H + n], missing, n, parts) {
-                    regress_gaps(&src, missing, centre, n, job.table, parts);
+                    gaps::regress_gaps::<H, T>(job.level, &rows, missing, n, job.table, parts);
                 }
                 store([z, y, x], n, job.slope, parts, out);
             }
@@ -314,6 +320,12 @@ fn join_columns<const H: usize>(sums: &[f64], parts: &mut [f64]) {
     }
 }
 
+/// Whether there is nothing here.
+#[inline(always)]
+fn all_missing<T: Voxel>(centres: &[T], missing: Option<T>) -> bool {
+    centres.iter().all(|v| <f64 as Sum<T>>::of(*v, missing).is_nan())
+}
+
 /// Whether a centre is missing or a component NaN.
 #[inline(always)]
 fn any_nan<T: Voxel>(centres: &[T], missing: Option<T>, n: usize, parts: &[f64]) -> bool {
@@ -328,30 +340,6 @@ fn any_nan<T: Voxel>(centres: &[T], missing: Option<T>, n: usize, parts: &[f64])
         }
     }
     any
-}
-
-/// Puts the full regression where a voxel of the window is missing. A missing voxel makes a component NaN, since each but
-/// the centre has a weight in one at least.
-#[inline(never)]
-fn regress_gaps<T: Voxel>(
-    src: &View<T>,
-    missing: Option<T>,
-    [z, y, x]: [usize; 3],
-    n: usize,
-    table: &Table,
-    parts: &mut [f64],
-) {
-    let value = |z: usize, y: usize, x: usize| <f64 as Sum<T>>::of(src.at([z, y, x]), missing);
-    for i in 0..n {
-        let gone = value(z, y, x + i).is_nan();
-        if !gone && !(0..3).any(|a| parts[a * RUN + i].is_nan()) {
-            continue;
-        }
-        let fitted = if gone { Some([f64::NAN; 3]) } else { regression::fit(table, [z, y, x + i], value) };
-        if let Some(g) = fitted {
-            (0..3).for_each(|a| parts[a * RUN + i] = g[a]);
-        }
-    }
 }
 
 /// Scales, rounds once and stores `n` voxels from voxel `[z, y, x]` of the outputs on.

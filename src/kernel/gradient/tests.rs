@@ -84,9 +84,9 @@ fn equals_the_regression_for_every_type_level_and_brick() {
             } else if dtype.is_float() {
                 let mut noise = Noise(5);
                 let n = v.len();
-                let dense = n / 2;
                 for i in 0..n {
-                    if noise.below(if i < dense { 40 } else { 2 }) == 0 {
+                    // few, many, and windows that hold hardly anything
+                    if noise.below(100) < [2, 40, 93][3 * i / n] {
                         crate::with_voxels!(&mut v, v => v[i] = Voxel::from_f64(f64::NAN));
                     }
                 }
@@ -147,6 +147,94 @@ fn constants_give_zero_and_planes_their_slope() {
             let [_, z, y, x] = &got;
             assert!(z.iter().all(|g| *g == 0.0) && x.iter().all(|g| *g == -1.5), "{z:?} {x:?}");
             assert!(y.iter().all(|g| (g - 90.0).abs() < 1e-5), "{y:?}");
+        }
+    }
+}
+
+/// f = 3 z - 2 y + x / 2 where `there` says so, else missing; the slopes of windows of 5 that a row of centres sees.
+fn slopes_of(there: &dyn Fn([i64; 3]) -> bool, weight: GradientWeight, spacing: [f64; 3]) -> [Vec<f64>; 4] {
+    let shape = [5, 5, 40];
+    let f = |[z, y, x]: [i64; 3]| (3 * z - 2 * y) as f64 + x as f64 / 2.0;
+    let voxels = Region::whole(shape).iter().map(|p| if there(p) { f(p) } else { f64::NAN });
+    let v = Voxels::F64(voxels.collect());
+    let inner = Region::new([2, 2, 2], [3, 3, 38]);
+    let job = (5, weight, spacing, Affine::IDENTITY);
+    let first = run(&v, shape, inner, Level::Baseline, job);
+    for level in Level::available() {
+        let other = run(&v, shape, inner, level, job);
+        let bits = |o: &[Vec<f64>; 4]| o.iter().flatten().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(&first), bits(&other), "{level:?}");
+    }
+    first
+}
+
+#[test]
+fn voxels_of_one_plane_determine_no_slope_and_one_beside_it_does() {
+    let planes: [&dyn Fn([i64; 3]) -> bool; 5] = [
+        &|[z, ..]| z == 2,
+        &|[z, y, _]| z == y,
+        &|[z, y, _]| z == 2 && y == 2,
+        &|[z, y, x]| z == 2 && y == 2 && x % 3 == 0,
+        &|[z, y, x]| z == x - 18 && y < 4,
+    ];
+    for (k, plane) in planes.into_iter().enumerate() {
+        for (weight, spacing) in WEIGHTS.into_iter().flat_map(|w| [(w, [1.0; 3]), (w, [1e4, 1.0, 1e-2])]) {
+            let got = slopes_of(plane, weight, spacing);
+            for (i, g) in got[0].iter().enumerate() {
+                let there = plane([2, 2, i as i64 + 2]);
+                assert!(if there { g.to_bits() == 0 } else { g.is_nan() }, "plane {k} {weight:?} {spacing:?} {i}: {g}");
+            }
+        }
+    }
+    for (weight, spacing) in WEIGHTS.into_iter().flat_map(|w| [(w, [1.0; 3]), (w, [1e3, 1.0, 1e-2])]) {
+        let got = slopes_of(&|p| p[0] == p[1] || p == [4, 0, 20], weight, spacing);
+        for (x, i) in (2..38).zip(0..) {
+            for (a, slope) in [3.0, -2.0, 0.5].into_iter().enumerate() {
+                let expect = if (18..=22).contains(&x) { slope / spacing[a] } else { 0.0 };
+                assert!((got[a + 1][i] - expect).abs() <= 1e-7 * expect.abs(), "{weight:?} {x} {}", got[a + 1][i]);
+            }
+        }
+    }
+}
+
+#[test]
+fn beside_an_infinity_and_a_gap_there_is_no_number() {
+    let shape = [5, 5, 60];
+    let inner = Region::new([2, 2, 2], [3, 3, 58]);
+    for (weight, infinite) in WEIGHTS.into_iter().flat_map(|w| [(w, f64::INFINITY), (w, f64::NEG_INFINITY)]) {
+        let mut calm = calm(DType::F32, shape, 9);
+        crate::with_voxels!(&mut calm, v => v[4 * 300..].fill(Voxel::from_f64(f64::NAN)));
+        let mut hostile = calm.clone();
+        crate::with_voxels!(&mut hostile, v => v[2 * 300 + 2 * 60 + 20] = Voxel::from_f64(infinite));
+        let job = (5, weight, [1.0; 3], Affine::IDENTITY);
+        for level in Level::available() {
+            let (a, b) = (run(&calm, shape, inner, level, job), run(&hostile, shape, inner, level, job));
+            for (x, i) in (2..58).zip(0..) {
+                let reached = (18..=22).contains(&x);
+                assert!(
+                    !a[0][i].is_nan() && (reached && b[0][i].is_nan() || !reached && a[0][i] == b[0][i]),
+                    "voxel {x}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn constants_beside_gaps_give_exactly_zero() {
+    let shape = [9, 9, 60];
+    let inner = Region::new([2; 3], [7, 7, 58]);
+    for (dtype, value) in [(DType::F32, 0.1), (DType::F64, 1e300), (DType::F64, -1.0 / 3.0)] {
+        let mut v = crate::kernel::hostile::constant(dtype, shape, value);
+        let mut noise = Noise(3);
+        for i in 0..v.len() {
+            if noise.below(10) < 3 {
+                crate::with_voxels!(&mut v, v => v[i] = Voxel::from_f64(f64::NAN));
+            }
+        }
+        for weight in WEIGHTS {
+            let got = run(&v, shape, inner, Level::detect(), (5, weight, [1.0, 3.0, 0.3], Affine::IDENTITY));
+            assert!(got.iter().flatten().all(|g| g.is_nan() || g.to_bits() == 0), "{dtype} {value}");
         }
     }
 }
