@@ -21,7 +21,7 @@ type Words = [[u64; 8]; 8];
 fn apart(src: &[u8], dst: &mut [u8]) {
     assert_eq!(src.len(), dst.len());
     let plane = src.len() / 8;
-    if src.len() % 8 != 0 {
+    if !src.len().is_multiple_of(8) {
         return dst.copy_from_slice(src);
     }
     let (steps, rest) = src.as_chunks::<STEP>();
@@ -54,7 +54,7 @@ fn apart(src: &[u8], dst: &mut [u8]) {
 fn together(src: &[u8], dst: &mut [u8]) {
     assert_eq!(src.len(), dst.len());
     let plane = src.len() / 8;
-    if src.len() % 8 != 0 {
+    if !src.len().is_multiple_of(8) {
         return dst.copy_from_slice(src);
     }
     let (steps, rest) = dst.as_chunks_mut::<STEP>();
@@ -93,6 +93,7 @@ fn transpose_bits(x: u64) -> u64 {
 
 /// Swaps byte `k` of row `i` with byte `i` of row `k`, lane by lane.
 #[inline(always)]
+#[allow(clippy::needless_range_loop)] // two rows at a time
 fn transpose_bytes(rows: &mut Words) {
     for (apart, by, mask) in [(4, 32, 0xFFFF_FFFF), (2, 16, 0x0000_FFFF_0000_FFFF), (1, 8, 0x00FF_00FF_00FF_00FF)] {
         for i in (0..8).filter(|i| i & apart == 0) {
@@ -124,7 +125,7 @@ mod tests {
     /// Bit by bit.
     fn reference(src: &[u8]) -> Vec<u8> {
         let plane = src.len() / 8;
-        if src.len() % 8 != 0 {
+        if !src.len().is_multiple_of(8) {
             return src.to_vec();
         }
         let mut out = vec![0; src.len()];
