@@ -104,6 +104,14 @@ impl Pool {
         state.lent = state.lent.saturating_sub(buffer.capacity_bytes());
     }
 
+    /// Takes in a buffer that somebody else counted until now.
+    pub fn adopt(&self, buffer: Voxels) {
+        let mut state = self.lock();
+        state.waiting += buffer.capacity_bytes();
+        state.free.push(buffer);
+        state.make_room(0);
+    }
+
     /// Frees buffers, the longest waiting first, until at most `bytes` wait.
     pub fn trim(&self, bytes: usize) {
         self.lock().keep_waiting(bytes);
@@ -156,6 +164,9 @@ mod tests {
         assert_eq!(held(&pool), (0, 50_000), "what would break the bound is freed");
         pool.part_with(&other);
         assert_eq!(held(&pool), (0, 0));
+        pool.adopt(other);
+        assert_eq!(held(&pool), (50_000, 0), "lent to nobody");
+        let other = pool.take(DType::U16, 25_000);
         pool.bound(10);
         pool.put(other);
         assert_eq!(held(&pool), (0, 0));

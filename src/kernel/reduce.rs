@@ -89,6 +89,28 @@ impl Cells {
         [&self.value, &self.mark, &self.inner, &self.between].iter().map(|v| v.capacity() * size_of::<f64>()).sum()
     }
 
+    /// The cells, of any level, of a box in which every voxel has the finite value `v`, exactly as they are made from the voxels,
+    /// where all sums of `v` over a cell are exact; `excluded` by `where` or needed. Panics for Moments.
+    pub fn uniform(&mut self, kind: Reduce, factor: [usize; 3], extent: Shape, v: f64, excluded: bool) {
+        assert!(kind != Reduce::Moments, "moments of equal values are not made here");
+        self.prepare(kind, false, factor, extent);
+        let rows = self.shape[0] * self.shape[1];
+        let n = self.shape[2];
+        let mut value = std::mem::take(&mut self.value);
+        if kind == Reduce::Mean {
+            for c in 0..rows {
+                self.implied([c / self.shape[1], c % self.shape[1]], &mut value[c * n..(c + 1) * n]);
+            }
+            value.iter_mut().for_each(|count| *count *= v);
+        } else {
+            value.fill(v);
+        }
+        self.value = value;
+        for c in 0..if excluded { rows } else { 0 } {
+            self.marks(c).iter_mut().for_each(|m| *m = -*m);
+        }
+    }
+
     /// Makes the first level above `src`, halving the axes named. NaN voxels do not count (Moments: in either channel);
     /// excluded voxels enter only cells that cover nothing else. Stride takes the first voxel that counts, in z, y, x
     /// order. Panics if the shapes differ or Moments lack the mean.

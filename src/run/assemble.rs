@@ -58,7 +58,7 @@ pub struct TaskSlot {
 }
 
 /// Output, level, component, chunk index.
-type ChunkKey = (usize, usize, usize, [i64; 3]);
+pub(super) type ChunkKey = (usize, usize, usize, [i64; 3]);
 
 /// A chunk that waits for its last part.
 #[derive(Debug)]
@@ -116,7 +116,9 @@ impl Assembler<'_> {
                     self.ready(&place, ready, done.brick, &mut items)?;
                     continue;
                 }
-                self.component(&place, wire, comp, done, scratch, &mut items)?;
+                if !self.uniform(&place, wire, comp, done, scratch, &mut items)? {
+                    self.component(&place, wire, comp, done, scratch, &mut items)?;
+                }
             }
         }
         Ok(items)
@@ -165,7 +167,7 @@ impl Assembler<'_> {
     }
 
     /// Keeps the numbers of cells for the levels beyond.
-    fn spill(&self, place: &Place, brick: Region, numbers: &[f64]) {
+    pub(super) fn spill(&self, place: &Place, brick: Region, numbers: &[f64]) {
         let Some(spill) = &place.target.cells else { return };
         let k = place.output.brick_level();
         let region = place.output.level_box(k, brick);
@@ -185,16 +187,17 @@ impl Assembler<'_> {
     ) -> Result<()> {
         let output = place.output;
         let mut cx = Context { level: self.level, scratch };
-        let mut cells = self.room(output, 1, brick);
-        let mut fine = if output.brick_level() > 1 { self.room(output, 2, brick) } else { Cells::default() };
+        let mut cells = Cells::default();
         for k in 1..=output.brick_level() {
             let halved = output.level(k).expect("level exists").halved;
+            // Every level in a buffer of its own length: one that is cut for a coarser level would be cleared for the next brick.
+            let fine = std::mem::replace(&mut cells, self.room(output, k, brick));
             if k == 1 {
                 cells.first(output.reduce, output.is_std, src, halved, &mut cx);
             } else {
-                std::mem::swap(&mut cells, &mut fine);
                 cells.next_from(&fine, halved, &mut cx);
             }
+            self.put_cells(fine);
             let mut rounded = self.pool.take(output.spec.dtype, cells.shape.iter().product());
             cells.write([0; 3], self.mapping(place), rounded.view_mut(cells.shape), &mut cx);
             self.put(place, k, output.level_box(k, brick), rounded.view(cells.shape), items)?;
@@ -205,11 +208,14 @@ impl Assembler<'_> {
             cells.store(&mut data);
             self.spill(place, brick, &data);
         }
-        for made in [cells, fine] {
-            let numbers = [made.value, made.inner, made.between];
-            numbers.into_iter().filter(|n| n.capacity() > 0).for_each(|n| self.pool.put_numbers(n));
-        }
+        self.put_cells(cells);
         Ok(())
+    }
+
+    /// Gives back what [`Assembler::room`] took.
+    fn put_cells(&self, cells: Cells) {
+        let numbers = [cells.value, cells.inner, cells.between];
+        numbers.into_iter().filter(|n| n.capacity() > 0).for_each(|n| self.pool.put_numbers(n));
     }
 
     /// Room for the cells of level `k` over a brick.
@@ -288,7 +294,14 @@ impl Assembler<'_> {
     }
 
     /// Adds a part to an open chunk; returns it when that was the last.
-    fn park(&self, place: &Place, key: ChunkKey, chunk: Region, region: Region, view: AnyView) -> Option<Voxels> {
+    pub(super) fn park(
+        &self,
+        place: &Place,
+        key: ChunkKey,
+        chunk: Region,
+        region: Region,
+        view: AnyView,
+    ) -> Option<Voxels> {
         let mut open = place.slot.open.lock().unwrap_or_else(|e| e.into_inner());
         let entry = open.entry(key).or_insert_with(|| Open {
             voxels: self.pool.take(view.dtype(), chunk.voxels()),

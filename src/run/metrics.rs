@@ -242,7 +242,7 @@ impl Metrics {
 
     /// Private resident bytes now; remembers the most.
     pub fn sample_memory(&self) {
-        if let Some(bytes) = private_bytes() {
+        if let Some(bytes) = os::private_bytes() {
             self.peak.fetch_max(bytes, Relaxed);
         }
     }
@@ -266,12 +266,4 @@ impl Metrics {
         report.waits.insert("read_busy".into(), self.read_ns.load(Relaxed) as f64 * 1e-9);
         report.waits.insert("encode_busy".into(), self.encode_ns.load(Relaxed) as f64 * 1e-9);
     }
-}
-
-/// Private resident memory of this process: anonymous pages, not mapped files.
-pub fn private_bytes() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find(|l| l.starts_with("RssAnon:"))?;
-    let kib: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
-    Some(kib * 1024)
 }

@@ -26,6 +26,7 @@ pub mod sketch;
 pub mod steps;
 pub mod stream;
 pub mod trace;
+mod uniform;
 pub mod value;
 pub mod windowed;
 mod windows;

@@ -1,6 +1,7 @@
 //! Fills a brick's inputs, halos included, from sources: plain rows or cached chunks. Masks that hang on inputs are
 //! looked at first, so that what no mask needs is not read.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
@@ -202,9 +203,15 @@ impl Reader<'_> {
                 }
                 buffer
             });
-            match &chunk {
-                Chunk::Missing(value) => fill_box(dst.view_mut(region.shape()), region, chunk_box, *value),
-                Chunk::Decoded(voxels) => copy_into(voxels.view(shape), chunk_box, dst, region),
+            match chunk {
+                Chunk::Missing(value) => fill_box(dst.view_mut(region.shape()), region, chunk_box, value),
+                Chunk::Decoded(voxels) => {
+                    copy_into(voxels.view(shape), chunk_box, dst, region);
+                    // The cache let go of it, and no other brick holds it: the next chunk takes its place, still warm.
+                    if let Ok(voxels) = Arc::try_unwrap(voxels) {
+                        self.engine.pool.adopt(voxels);
+                    }
+                }
             }
         }
         Ok(match (target, common) {

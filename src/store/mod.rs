@@ -1,5 +1,7 @@
 //! Boxes of voxels from and to files. The only folder that names zarrs and memmap2.
 
+pub mod bits;
+pub mod blosc;
 pub mod info;
 pub mod layout;
 pub mod open;

@@ -352,3 +352,36 @@ fn buffers_are_reused() {
     assert_eq!((cells.capacity_bytes(), cells.value.as_ptr()), (held, at));
     assert_eq!(cells.shape, [2, 4, 4]);
 }
+
+#[test]
+fn cells_of_one_value_are_those_of_its_voxels() {
+    let (mut scratch, level) = (Scratch::new(), Level::detect());
+    let mut cx = Context { level, scratch: &mut scratch };
+    let values = [(DType::U8, 7.0), (DType::F32, 0.1f32 as f64), (DType::F32, -0.0), (DType::I32, -2147483647.0)];
+    for shape in [[8, 8, 8], [13, 9, 21], [1, 1, 1], [5, 1, 40]] {
+        for ((dtype, v), kind) in values.iter().flat_map(|v| KINDS.map(|k| (*v, k))) {
+            for excluded in [false, true] {
+                let mut voxels = Voxels::zeroed(dtype, shape.iter().product());
+                crate::with_voxels!(&mut voxels, w => w.fill(Voxel::from_f64(v)));
+                let mask = vec![0; shape.iter().product()];
+                let needed = excluded.then(|| View::dense(&mask, shape));
+                let src = Level0 { value: voxels.view(shape), mean: None, needed };
+                let (mut made, mut next, mut short) = (Cells::default(), Cells::default(), Cells::default());
+                made.first(kind, false, src, ALL, &mut cx);
+                for k in 1..4 {
+                    short.uniform(kind, [1 << k; 3], shape, v, excluded);
+                    let (mut a, mut b) = (Vec::new(), Vec::new());
+                    made.store(&mut a);
+                    short.store(&mut b);
+                    let bits = |v: &[f64]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+                    assert_eq!(bits(&a), bits(&b), "{shape:?} {dtype} {v} {kind:?} {excluded} level {k}");
+                    next.next_from(&made, ALL, &mut cx);
+                    std::mem::swap(&mut made, &mut next);
+                }
+            }
+        }
+    }
+}
+
+/// Reductions of one channel by itself.
+const KINDS: [Reduce; 4] = [Reduce::Mean, Reduce::Min, Reduce::Max, Reduce::Stride];

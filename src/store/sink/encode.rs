@@ -4,18 +4,13 @@ use std::borrow::Cow;
 use std::sync::Mutex;
 
 use zarrs::array::codec::ZstdCodec;
-use zarrs::array::codec::bytes_to_bytes::blosc::{
-    BloscCompressionLevel, BloscCompressor, BloscShuffleMode, blosc_compress_bytes,
-};
 use zarrs::array::{BytesToBytesCodecTraits, CodecOptions};
 
 use super::Encoded;
 use crate::config::Codec;
 use crate::grid::{AnyView, DType, Shape, View, Voxel};
+use crate::store::blosc;
 use crate::{Error, Result, with_dtype, with_view};
-
-/// Compression level of blosc, SPEC section 6.
-pub const BLOSC_LEVEL: u8 = 5;
 
 /// Pads and compresses chunks. Buffers are kept for the next chunk.
 #[derive(Debug)]
@@ -70,16 +65,21 @@ impl Encoder {
             if self.holds_only_fill(v) {
                 return Ok(Encoded::Empty);
             }
-            let mut raw = self.buffers.lock().unwrap_or_else(|e| e.into_inner()).pop().unwrap_or_default();
+            let mut raw = self.buffer();
             raw.clear();
             self.pad(v, chunk, &mut raw);
-            let encoded = self.compress(&raw, v.data);
+            let encoded = self.compress(&raw, voxels.dtype().size());
             if self.codec == Codec::None {
                 return Ok(Encoded::Bytes(raw));
             }
             self.reuse(raw);
             encoded.map(Encoded::Bytes)
         })
+    }
+
+    /// A buffer with whatever it held.
+    fn buffer(&self) -> Vec<u8> {
+        self.buffers.lock().unwrap_or_else(|e| e.into_inner()).pop().unwrap_or_default()
     }
 
     /// Takes back bytes that were written, for the next chunk.
@@ -117,16 +117,15 @@ impl Encoder {
         repeat(out, (chunk[0] - nz) * chunk[1] * chunk[2]);
     }
 
-    fn compress<T: Voxel>(&self, raw: &[u8], _: &[T]) -> Result<Vec<u8>> {
+    fn compress(&self, raw: &[u8], voxel: usize) -> Result<Vec<u8>> {
         let failed = |e: &dyn std::fmt::Display| Error::Failed(format!("a chunk cannot be compressed: {e}"));
         let mut bytes = match self.codec {
             Codec::None => Vec::new(),
             Codec::BloscLz4 => {
-                let level = BloscCompressionLevel::try_from(BLOSC_LEVEL).map_err(|e| failed(&e))?;
-                let shuffle =
-                    if size_of::<T>() == 1 { BloscShuffleMode::BitShuffle } else { BloscShuffleMode::Shuffle };
-                let lz4 = BloscCompressor::LZ4;
-                blosc_compress_bytes(raw, level, shuffle, size_of::<T>(), lz4, 0, 1).map_err(|e| failed(&e))?
+                let mut room = self.buffer();
+                let bytes = blosc::compress(raw, voxel, &mut room);
+                self.reuse(room);
+                bytes.map_err(|e| failed(&e))?
             }
             Codec::Zstd(level) => {
                 let encoded = ZstdCodec::new(level, false).encode(Cow::Borrowed(raw), &self.options);

@@ -3,9 +3,9 @@
 use serde_json::{Map, Value, json};
 
 use super::SinkSpec;
-use super::encode::BLOSC_LEVEL;
 use crate::config::{Codec, OutputFormat};
 use crate::grid::DType;
+use crate::store::blosc;
 
 /// Colours of channels that have no others, hexadecimal RGB.
 const COLOURS: [&str; 7] = ["FF0000", "00FF00", "0000FF", "FFFFFF", "FF00FF", "00FFFF", "FFFF00"];
@@ -88,7 +88,7 @@ fn codecs_v3(spec: &SinkSpec) -> Value {
         Codec::BloscLz4 => {
             let shuffle = if spec.dtype.size() == 1 { "bitshuffle" } else { "shuffle" };
             let configuration = json!({
-                "cname": "lz4", "clevel": BLOSC_LEVEL, "shuffle": shuffle, "typesize": spec.dtype.size(), "blocksize": 0,
+                "cname": "lz4", "clevel": blosc::LEVEL, "shuffle": shuffle, "typesize": spec.dtype.size(), "blocksize": 0,
             });
             json!([bytes, { "name": "blosc", "configuration": configuration }])
         }
@@ -102,7 +102,7 @@ pub fn array_v2(spec: &SinkSpec, level: usize) -> Value {
         Codec::Zstd(level) => json!({ "id": "zstd", "level": level }),
         Codec::BloscLz4 => {
             let shuffle = if spec.dtype.size() == 1 { 2 } else { 1 };
-            json!({ "id": "blosc", "cname": "lz4", "clevel": BLOSC_LEVEL, "shuffle": shuffle, "blocksize": 0 })
+            json!({ "id": "blosc", "cname": "lz4", "clevel": blosc::LEVEL, "shuffle": shuffle, "blocksize": 0 })
         }
     };
     json!({

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use memmap2::Mmap;
 
 use crate::brick::Voxels;
-use crate::store::os;
+use crate::store::os::{self, FileExt};
 use crate::{Error, Result};
 
 /// A whole file, mapped for reading.
@@ -47,6 +47,17 @@ impl MappedFile {
         Ok(&self.map)
     }
 
+    /// Fills `into` from byte `from` on, without touching the map.
+    pub fn read_at(&self, from: u64, into: &mut [u8]) -> Result<()> {
+        self.file.read_exact_at(into, from).map_err(|e| match e.kind() {
+            std::io::ErrorKind::UnexpectedEof => {
+                let (was, now) = (self.len(), self.file.metadata().map_or(0, |m| m.len()));
+                Error::file(&self.path, format!("shrank from {was} to {now} bytes while it was being read"))
+            }
+            _ => Error::file(&self.path, format!("cannot be read: {e}")),
+        })
+    }
+
     /// Tells the system that the whole pages inside `start..end` will not be wanted soon.
     pub fn forget(&self, start: u64, end: u64) {
         const PAGE: u64 = 1 << 16; // a multiple of every page size in use
@@ -74,6 +85,11 @@ impl Files {
         if let Files::Held(files) = self {
             files[index].forget(start, end);
         }
+    }
+
+    /// File `index`, where it stays open.
+    pub fn held(&self, index: usize) -> Option<&MappedFile> {
+        if let Files::Held(files) = self { files.get(index) } else { None }
     }
 
     /// Runs `f` on the bytes of file `index`.

@@ -20,8 +20,8 @@ use super::zarr_meta::{self, ArrayMeta, Multiscale, ShardMeta};
 use crate::brick::Voxels;
 use crate::config::Input;
 use crate::grid::{Region, Voxel};
-use crate::store::VolumeInfo;
 use crate::store::os::FileExt;
+use crate::store::{VolumeInfo, blosc};
 use crate::{Error, Result, with_dtype};
 
 /// An open Zarr array.
@@ -40,6 +40,8 @@ pub struct ZarrArray {
     /// Chunks of the volume along z, y, x.
     grid: [i64; 3],
     options: CodecOptions,
+    /// Chunks are blosc's containers of one component's one-byte voxels, and nothing else.
+    bits_only: bool,
     /// Folders that changed later may have lost chunks.
     opened: SystemTime,
 }
@@ -275,7 +277,28 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     // A server's clock may run ahead of this machine's.
     let touched = folder.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
     let opened = touched.max(SystemTime::now());
-    Ok((info, ZarrArray { folder, meta, array, codecs, inner, fill, shards, lead, components, grid, options, opened }))
+    let plain =
+        meta.codecs == ["bytes", "blosc"] || meta.codecs == ["blosc"] && meta.value["order"].as_str() == Some("C");
+    let bits_only =
+        plain && meta.packing.is_none() && meta.dtype.size() == 1 && meta.inner[..lead].iter().all(|n| *n == 1);
+    Ok((
+        info,
+        ZarrArray {
+            folder,
+            meta,
+            array,
+            codecs,
+            inner,
+            fill,
+            shards,
+            lead,
+            components,
+            grid,
+            options,
+            bits_only,
+            opened,
+        },
+    ))
 }
 
 /// Runs a call into the Zarr library; a panic there (broken metadata or data) becomes an error.
@@ -323,13 +346,19 @@ impl ZarrArray {
     /// Decodes one inner chunk into `dst`; see [`super::Source::read_chunk`].
     pub fn read_chunk(&self, component: usize, chunk: [i64; 3], dst: &mut Voxels) -> Result<ChunkRead> {
         let index = self.index(component, chunk)?;
-        let Some((path, bytes)) = self.encoded(&index)? else {
+        let Some((path, mut bytes)) = self.encoded(&index)? else {
             return Ok(ChunkRead::Missing(self.fill));
         };
         let stored_bytes = bytes.len() as u64;
         let corrupt = |e: String| Error::file(&path, format!("chunk {index:?} cannot be decoded: {e}"));
         let size = self.meta.dtype.size() as u64;
         let want = self.meta.inner.iter().product::<u64>() * size;
+        if self.bits_only && dst.dtype() == self.meta.dtype {
+            let done = guarded(|| blosc::decompress_bits(&mut bytes, dst.as_bytes_mut())).map_err(corrupt)?;
+            if done {
+                return Ok(ChunkRead::Data { stored_bytes });
+            }
+        }
         let unpacked = chunk_codecs::unpacked_bytes(&self.meta.codecs, want, self.most_encoded());
         let bytes = match self.meta.packing {
             Some(packing) => packing.unpack(&bytes, *unpacked.end()).map_err(corrupt)?,
