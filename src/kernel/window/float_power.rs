@@ -124,6 +124,12 @@ pub fn cdf_power<T: Centre>(level: Level, row: &Windows<T>, polarity: Polarity, 
     }
 }
 
+/// [`cdf_power`] of f32, which tests and benches outside the crate judge over its whole domain.
+#[doc(hidden)]
+pub fn power_row(level: Level, [v, lo, hi]: [&[f32]; 3], s: &[f64], n: &[f64], out: &mut [f32]) {
+    cdf_power(level, &Windows { v, lo, hi, s, n }, Polarity { flipped: false, constant: 0.0 }, out);
+}
+
 #[inline(always)]
 fn power_inner<L: F32x32, T: Centre, const FLIPPED: bool>(
     row: &Windows<T>,

@@ -38,6 +38,8 @@ mod tests;
 
 use emit::Emit;
 pub use estimate::Width;
+#[doc(hidden)]
+pub use float_power::power_row;
 use int::Dispatch;
 pub use plan::Needs;
 use plan::{Job, Plain};
