@@ -70,8 +70,10 @@ crate::multiversion! {
 #[inline(always)]
 fn settle_inner<A: Sum>(s: &[A], n: &[f64], lines: &[f64], section: f64, m: &mut [f64]) {
     for (((m, s), n), c) in m.iter_mut().zip(s).zip(n).zip(lines) {
-        let (v, s) = (*m / (section * c), s.rounded());
-        let v = if v * n > s * s * A::NOTHING { v } else { 0.0 };
+        let whole = section * c;
+        let (v, s) = (*m / whole, s.rounded());
+        let nothing = if *n == whole { A::NOTHING } else { A::NOTHING_BESIDE_GAPS };
+        let v = if v * n > s * s * nothing { v } else { 0.0 };
         *m = if s.is_finite() { v } else { f64::NAN };
     }
 }

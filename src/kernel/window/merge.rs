@@ -103,6 +103,8 @@ pub trait Sum: Plain + Default + std::fmt::Debug {
     /// A variance below this share of the squared mean is an error of rounding: two different numbers of the input's type
     /// among 2^31 make a larger one.
     const NOTHING: f64;
+    /// The same in windows with gaps, whose counts are shares of lines and so not exact.
+    const NOTHING_BESIDE_GAPS: f64;
     fn of(hi: f64, lo: f64) -> Self;
     /// `self - n * v`.
     fn less(self, n: f64, v: f64) -> f64;
@@ -114,6 +116,7 @@ pub trait Sum: Plain + Default + std::fmt::Debug {
 impl Sum for f64 {
     const PAIR: bool = false;
     const NOTHING: f64 = 8.077_935_669_463_161e-28; // 2^-90
+    const NOTHING_BESIDE_GAPS: f64 = Self::NOTHING;
     #[inline(always)]
     fn of(hi: f64, _: f64) -> f64 {
         hi
@@ -146,6 +149,7 @@ unsafe impl Plain for Pair {}
 impl Sum for Pair {
     const PAIR: bool = true;
     const NOTHING: f64 = 7.006_492_321_624_085e-46; // 2^-150
+    const NOTHING_BESIDE_GAPS: f64 = 7.888_609_052_210_118e-31; // 2^-100
     #[inline(always)]
     fn of(hi: f64, lo: f64) -> Pair {
         Pair { hi, lo }

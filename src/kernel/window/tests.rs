@@ -341,6 +341,30 @@ fn bricks_never_show() {
 }
 
 #[test]
+fn equal_values_beside_missing_ones_have_no_variance() {
+    let shape = [9, 11, 40];
+    for dtype in [DType::F32, DType::F64] {
+        for (value, share) in [(0.1, 0.05), (-7.3e9, 0.4), (1.0 / 3.0, 0.9)] {
+            let mut next = random(31);
+            let mut gap = || (next() >> 11) as f64 / (1u64 << 53) as f64 <= share;
+            let volume = make(dtype, shape, |_| if gap() { f64::NAN } else { value });
+            let p = params([2, 3, 4]);
+            let channels = [WindowChannel::Variance, WindowChannel::Std];
+            for made in brick(&volume, shape, &p, [0; 3], shape, &channels, Level::detect()) {
+                for i in 0..made.len() {
+                    let expected = if volume.at(i).is_nan() { f64::NAN } else { 0.0 };
+                    assert_eq!(
+                        made.at(i).to_bits(),
+                        expected.to_bits(),
+                        "{value} of {dtype}, {share} missing, voxel {i}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
 fn a_missing_voxel_far_away_changes_no_bit() {
     let shape = [12, 14, 90];
     for dtype in [DType::F32, DType::F64, DType::U16, DType::I8] {
