@@ -90,7 +90,7 @@ centre!(f32, f64, 8.077_936e-28, 1.237_940_1e27, 8.077_936e-28); // 2^-90 and 2^
 centre!(f64, Pair, 3.872_591_914_849_318e-121, 2.582_249_878_086_908_6e120, 8.077_935_669_463_161e-28); // 2^-400, 2^400, 2^-90
 
 crate::on_singles! {
-    fn power_at[T: Centre, const FLIPPED: bool](row: &Windows<T>, constant: f32, out: &mut [f32], wild: &mut bool) =
+    fn power_at[T: Centre, const FLIPPED: bool](row: &Windows<T>, constant: f32, out: &mut [f32], endless: &mut bool) =
         power_inner[T, FLIPPED];
 }
 
@@ -110,15 +110,18 @@ pub fn cdf_power<T: Centre>(level: Level, row: &Windows<T>, polarity: Polarity, 
         }
         return;
     }
-    let mut wild = false;
+    let mut endless = false;
     match polarity.flipped {
-        false => power_at::<T, false>(level, row, polarity.constant, out, &mut wild),
-        true => power_at::<T, true>(level, row, polarity.constant, out, &mut wild),
+        false => power_at::<T, false>(level, row, polarity.constant, out, &mut endless),
+        true => power_at::<T, true>(level, row, polarity.constant, out, &mut endless),
     }
-    if wild {
+    if endless {
         for (i, o) in out.iter_mut().enumerate() {
-            if T::is_wild(row.v[i], row.lo[i], row.hi[i]) {
-                *o = power_voxel(row.v[i], row.lo[i], row.hi[i], row.s[i], row.n[i], polarity);
+            let [v, lo, hi] = [row.v[i], row.lo[i], row.hi[i]].map(T::to_f64);
+            if lo == hi {
+                *o = polarity.constant;
+            } else if lo.is_infinite() || hi.is_infinite() {
+                *o = infinite(v, lo, hi, polarity.flipped, [1.0, 0.0]);
             }
         }
     }
@@ -135,14 +138,19 @@ fn power_inner<L: F32x32, T: Centre, const FLIPPED: bool>(
     row: &Windows<T>,
     constant: f32,
     out: &mut [f32],
-    wild: &mut bool,
+    endless: &mut bool,
 ) {
     let [mut ratios, mut betas, mut exponents] = [const { Strip([0.0; STRIP]) }; 3];
     let mut from = 0;
     loop {
         let to = out.len().min(from + STRIP);
         let (part, len) = (row.part(from, to), to - from);
-        *wild |= T::quotients::<FLIPPED>(&part, constant, [&mut ratios.0[..len], &mut betas.0[..len]]);
+        if T::quotients::<FLIPPED>(&part, constant, [&mut ratios.0[..len], &mut betas.0[..len]]) {
+            for i in (0..len).filter(|i| T::is_wild(part.v[*i], part.lo[*i], part.hi[*i])) {
+                [ratios.0[i], betas.0[i]] = wild_quotients::<T, FLIPPED>(&part, i);
+                *endless |= part.lo[i].to_f64().is_infinite() | part.hi[i].to_f64().is_infinite();
+            }
+        }
         let strips = [ratios.0.as_ptr(), betas.0.as_ptr()];
         // SAFETY: `len` is at least 32, at most that of a strip, and so much of them was written.
         unsafe { powers::<L, f32>(strips, exponents.0.as_mut_ptr(), &mut out[from..to]) };
@@ -154,26 +162,22 @@ fn power_inner<L: F32x32, T: Centre, const FLIPPED: bool>(
     }
 }
 
-/// `t^beta` of any finite or infinite window, in f64.
-fn power_voxel<T: Voxel, A: Sum>(v: T, lo: T, hi: T, s: A, n: f64, polarity: Polarity) -> f32 {
-    let (v, lo, hi) = (v.to_f64(), lo.to_f64(), hi.to_f64());
-    if lo == hi {
-        return polarity.constant;
-    }
-    if !lo.is_finite() || !hi.is_finite() {
-        return infinite(v, lo, hi, polarity.flipped, [1.0, 0.0]);
-    }
+/// The quotients of window `i`, finite but wild, in f64.
+fn wild_quotients<T: Centre, const FLIPPED: bool>(row: &Windows<T>, i: usize) -> [f32; 2] {
+    let [v, lo, hi] = [row.v[i], row.lo[i], row.hi[i]].map(T::to_f64);
     // Halves: the range of f64 values may exceed the largest of them.
-    let (below, above, range) = (0.5 * v - 0.5 * lo, 0.5 * hi - 0.5 * v, 0.5 * hi - 0.5 * lo);
-    let (over, under) = (s.less(n, lo), -s.less(n, hi));
-    let (a, b, p, q) = if polarity.flipped { (above, below, under, over) } else { (below, above, over, under) };
-    if a == 0.0 || b == 0.0 {
-        return if b == 0.0 { 1.0 } else { 0.0 };
+    let (below, above, range) = (0.5 * v - 0.5 * lo + 0.0, 0.5 * hi - 0.5 * v + 0.0, 0.5 * hi - 0.5 * lo);
+    let (over, under) = (row.s[i].less(row.n[i], lo), -row.s[i].less(row.n[i], hi));
+    let (a, b, p, q) = if FLIPPED { (above, below, under, over) } else { (below, above, over, under) };
+    let (near, beta) = (b + b < a, p / q);
+    let ratio = (if near { -b } else { a } / range) as f32;
+    if near || a == 0.0 || ratio >= f32::MIN_POSITIVE {
+        return [ratio, beta as f32];
     }
-    let beta = (p / q).clamp(1e-6, 1e6);
-    let log =
-        if 3.0 * b < range { math::log2_1p((-b / range) as f32) as f64 } else { math::log2(a) - math::log2(range) };
-    math::exp2((beta * log) as f32)
+    // Smaller than f32 can be: t^beta is a power of 2^-64, too.
+    const SMALL: f32 = 5.421_011e-20; // 2^-64
+    let log = math::log2(a) - math::log2(range);
+    [SMALL, (beta.clamp(1e-6, 1e6) * log / -64.0) as f32]
 }
 
 #[cfg(test)]
