@@ -172,14 +172,21 @@ impl Case {
         let mut seen = std::collections::HashMap::new();
         let line = passes.iter().map(|(name, seconds)| {
             let cell = match *name {
-                "window_sums32" | "window_extremes" | "gaussian" => 4,
+                "window_sums_z" | "window_sums_y" | "window_sums32" => 4,
+                "window_extremes_z" | "window_extremes_y" | "window_extremes" => 4,
+                "gaussian" | "gaussian_rows" => 4,
                 "window_sums64" | "window_order" => 8,
                 "window_moments" if square => 20,
                 "window_moments" | "gaussian_variance" => 12,
                 _ => 0,
             };
             let number = seen.entry(*name).or_insert(0);
-            let from = if *number % 3 == 0 { dtype.size() } else { cell };
+            let first = match *name {
+                "window_sums_z" | "window_extremes_z" | "gaussian_rows" => true,
+                "window_sums64" | "window_order" | "window_moments" | "gaussian_variance" => *number % 3 == 0,
+                _ => false,
+            };
+            let from = if first { dtype.size() } else { cell };
             *number += 1;
             let share = match cell {
                 0 => String::new(),

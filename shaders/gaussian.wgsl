@@ -1,5 +1,5 @@
 // Truncated Gaussian mean along one axis: c + sum_k w_k ((a_k + b_k) - 2 c), where a_k and b_k stand k steps before and
-// after the centre c, or are c where they do not exist. One thread makes four outputs along the axis, whose taps move on
+// after the centre c, or are c where they do not exist. One thread makes eight outputs along the axis, whose taps move on
 // by one voxel with each step, so that each voxel is read once.
 //
 // Agrees bit for bit with src/kernel/gaussian (mean_row in f32), since every operation is rounded by itself (floats.wgsl).
@@ -13,55 +13,71 @@ fn value(index: u32, packed: bool) -> f32 {
     return bitcast<f32>(input[index]);
 }
 
-fn alone4(v: vec4<f32>) -> vec4<f32> {
-    return vec4<f32>(alone(v.x), alone(v.y), alone(v.z), alone(v.w));
+// Of outputs k and on.
+fn weights_of(k: u32, d: u32) -> vec4<f32> {
+    return vec4<f32>(weight(k, d), weight(k + 1u, d), weight(k + 2u, d), weight(k + 3u, d));
 }
 
-fn weights_at(index: u32) -> vec4<f32> {
-    let bits = vec4<u32>(weights[index], weights[index + 1u], weights[index + 2u], weights[index + 3u]);
-    return bitcast<vec4<f32>>(bits);
+// What eight outputs see, the first four and the last four.
+struct Eight {
+    a: vec4<f32>,
+    b: vec4<f32>,
 }
 
-// What the four see where they have all their taps, or what lies beyond them, which is not kept.
+// Each voxel in the place of the one after it, and one more before the first; and the other way around.
+fn with_first(e: Eight, v: f32) -> Eight {
+    return Eight(vec4<f32>(v, e.a.xyz), vec4<f32>(e.a.w, e.b.xyz));
+}
+
+fn with_last(e: Eight, v: f32) -> Eight {
+    return Eight(vec4<f32>(e.a.yzw, e.b.x), vec4<f32>(e.b.yzw, v));
+}
+
+fn kept_at(at: Centre, k: u32, sum: f32) {
+    if k < p.m - at.k {
+        output[at.output + k * p.out_axis] = bitcast<u32>(sum);
+    }
+}
+
+// A voxel so many steps after the first centre, or anything where it does not exist.
+fn ahead_of(at: Centre, step: u32, packed: bool) -> f32 {
+    return value(at.here + min(step, at.after) * p.in_axis, packed);
+}
+
+// What all see where they have all their taps, or what lies beyond them, which is not kept.
 fn smooth_at(at: Centre, packed: bool) {
     let by = p.in_axis;
-    var c = vec4<f32>();
-    for (var j = 0u; j < min(4u, at.after + 1u); j += 1u) {
-        c[j] = value(at.here + j * by, packed);
-    }
-    let number = vec4<i32>(0, 1, 2, 3);
-    let before = vec4<i32>(i32(at.before)) + number;
-    let after = vec4<i32>(i32(at.after)) - number;
-    let twice = alone4(c + c);
+    var c = Eight();
+    c.a = vec4<f32>(value(at.here, packed), ahead_of(at, 1u, packed), ahead_of(at, 2u, packed), ahead_of(at, 3u, packed));
+    c.b = vec4<f32>(ahead_of(at, 4u, packed), ahead_of(at, 5u, packed), ahead_of(at, 6u, packed), ahead_of(at, 7u, packed));
+    let twice = Eight(c.a + c.a, c.b + c.b);
     var sum = c;
     // Each step brings a voxel into both.
     var low = c;
     var high = c;
-    // Along x every row of threads has ends.
-    let inside = p.axis != 2u && at.before >= p.radius && at.after >= p.radius + 3u;
+    let inside = at.before >= p.radius && at.after >= p.radius + 7u;
     for (var d = 1u; inside && d <= p.radius; d += 1u) {
-        low = vec4<f32>(value(at.here - d * by, packed), low.xyz);
-        high = vec4<f32>(high.yzw, value(at.here + (d + 3u) * by, packed));
-        // All four have the same weights.
-        let w = bitcast<f32>(weights[at.weights + (d - 1u) * p.m]);
-        sum = alone4(sum + alone4(w * alone4(alone4(low + high) - twice)));
+        low = with_first(low, value(at.here - d * by, packed));
+        high = with_last(high, value(at.here + (d + 7u) * by, packed));
+        // All have the same weights.
+        let w = weight(at.k, d);
+        sum.a += alone4(w * ((low.a + high.a) - twice.a));
+        sum.b += alone4(w * ((low.b + high.b) - twice.b));
     }
+    let number = vec4<i32>(0, 1, 2, 3);
+    let before = vec4<i32>(i32(at.before)) + number;
+    let after = vec4<i32>(i32(at.after)) - number;
     for (var d = 1u; !inside && d <= p.radius; d += 1u) {
-        let step = i32(d);
-        low = vec4<f32>(0.0, low.xyz);
-        if d <= at.before {
-            low.x = value(at.here - d * by, packed);
-        }
-        high = vec4<f32>(high.yzw, 0.0);
-        if d + 3u <= at.after {
-            high.w = value(at.here + (d + 3u) * by, packed);
-        }
-        let a = select(c, low, vec4<i32>(step) <= before);
-        let b = select(c, high, vec4<i32>(step) <= after);
-        let w = weights_at(at.weights + (d - 1u) * p.m);
-        sum = alone4(sum + alone4(w * alone4(alone4(a + b) - twice)));
+        let step = vec4<i32>(i32(d));
+        low = with_first(low, value(at.here - min(d, at.before) * by, packed));
+        high = with_last(high, ahead_of(at, d + 7u, packed));
+        let first = select(c.a, low.a, step <= before) + select(c.a, high.a, step <= after);
+        let second = select(c.b, low.b, step <= before + 4) + select(c.b, high.b, step <= after - 4);
+        sum.a += alone4(weights_of(at.k, d) * (first - twice.a));
+        sum.b += alone4(weights_of(at.k + 4u, d) * (second - twice.b));
     }
-    for (var j = 0u; j < min(4u, p.m - at.k); j += 1u) {
-        output[at.output + j * p.out_axis] = bitcast<u32>(sum[j]);
+    for (var k = 0u; k < 4u; k += 1u) {
+        kept_at(at, k, sum.a[k]);
+        kept_at(at, k + 4u, sum.b[k]);
     }
 }

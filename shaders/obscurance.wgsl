@@ -61,13 +61,14 @@ const NOT_SWEPT: u32 = 0xffffffffu;
 const NONE: u32 = 0xffffu;
 
 // Links of the chain that a thread has at hand, less one.
-const KEPT: u32 = 16u;
+const KEPT: u32 = 8u;
 
 var<private> p: Lines;
 // Of each thread a ring of codes and planes, every 64 entries one, each greater than the one above it; under the lowest an end.
 var<workgroup> stack: array<Entry, KEPT * 64u>;
-// Where the thread's highest one stands.
+// Where the thread's highest one stands, and what it is.
 var<private> highest: u32;
+var<private> top: Entry;
 
 fn code(plane: u32, at: vec2<i32>) -> u32 {
     let index = p.code_at + plane * p.code_a + u32(at.x) * p.code_b + u32(at.y) * p.code_c;
@@ -82,12 +83,14 @@ fn shift(plane: u32) -> vec2<i32> {
 
 // The place at another plane; z is 1 where the way there leaves the box at a side and comes back at the other.
 fn move_by(at: vec2<i32>, by: vec2<i32>) -> vec3<i32> {
-    let size = vec2<i32>(i32(p.size_b), i32(p.size_c));
     let moved = at + by;
-    let inside = all(moved >= vec2<i32>(0)) && all(moved < size);
+    if u32(moved.x) < p.size_b && u32(moved.y) < p.size_c {
+        return vec3<i32>(moved, 0);
+    }
+    let size = vec2<i32>(i32(p.size_b), i32(p.size_c));
     let low = select(vec2<i32>(0), size, moved < vec2<i32>(0));
     let high = select(vec2<i32>(0), size, moved >= size);
-    return vec3<i32>(moved + low - high, select(1, 0, inside));
+    return vec3<i32>(moved + low - high, 1);
 }
 
 fn place_of(plane: u32, thread: u32) -> u32 {
@@ -96,7 +99,8 @@ fn place_of(plane: u32, thread: u32) -> u32 {
 
 // Empties the stack.
 fn forget() {
-    stack[highest] = entry_of(TOP, NONE);
+    top = entry_of(TOP, NONE);
+    stack[highest] = top;
 }
 
 fn below_of(slot: u32) -> u32 {
@@ -111,7 +115,8 @@ fn above_of(slot: u32) -> u32 {
 fn leave(plane: u32, thread: u32, own: u32, step: u32) {
     links[place_of(plane, thread)] = entry_of(own, step);
     highest = above_of(highest);
-    stack[highest] = entry_of(own, plane);
+    top = entry_of(own, plane);
+    stack[highest] = top;
     stack[above_of(highest)] = entry_of(TOP, NONE);
 }
 
@@ -124,8 +129,8 @@ fn seek(plane: u32, own: u32, room: u32, thread: u32, way: i32) -> u32 {
     }
     let below = entry_of(own, NONE);
     var last = NONE; // plane of the lowest that was not greater
-    var entry = stack[highest];
-    for (var k = 0u; k < KEPT && !is_beyond(entry, below); k += 1u) {
+    var entry = top;
+    while !is_beyond(entry, below) {
         last = step_of(entry);
         highest = below_of(highest);
         entry = stack[highest];
@@ -154,9 +159,10 @@ fn contribution(table: u32, d: u32) -> u32 {
 }
 
 fn add_up(plane: u32, at: vec2<i32>, sum: u32) {
-    let out = vec3<i32>(i32(plane) - p.at_a, at.x - p.at_b, at.y - p.at_c);
-    if all(out >= vec3<i32>(0)) && all(out < vec3<i32>(i32(p.out_a), i32(p.out_b), i32(p.out_c))) {
-        atomicAdd(&sums[u32(out.x) * p.sum_a + u32(out.y) * p.sum_b + u32(out.z) * p.sum_c], sum);
+    // What lies before the box wraps to beyond it.
+    let out = vec3<u32>(plane - u32(p.at_a), u32(at.x - p.at_b), u32(at.y - p.at_c));
+    if out.x < p.out_a && out.y < p.out_b && out.z < p.out_c {
+        atomicAdd(&sums[out.x * p.sum_a + out.y * p.sum_b + out.z * p.sum_c], sum);
     }
 }
 

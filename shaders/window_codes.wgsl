@@ -38,12 +38,16 @@ struct Codes {
     share: vec2<u32>, // f64: 1 / whole
     slope: vec2<u32>,
     intercept: vec2<u32>,
+    inverse: f32,   // 1 / whole
+    spare_0: u32,
+    spare_1: u32,
+    spare_2: u32,
     channels: array<vec4<u32>, 4>, // what each is, and 256 where constant windows are half open
 }
 
 // What is compiled: 1 results in f64, 2 numerators of variances, 4 openness by powers, 8 by spreads, 16 counts
-// of voxels.
-override parts: u32 = 31u;
+// of voxels, 32 other channels than one mean that is not scaled, 64 sums of two words.
+override parts: u32 = 127u;
 
 // Divisions that find a thread's place cost as much as a voxel.
 const STRIP: u32 = 8u;
@@ -152,55 +156,59 @@ fn of_difference(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     return of_integer(minus64(a, b));
 }
 
-// The f32 nearest to d / n, half to even, of a count n below 2^27 and an integer d below 2^16 n: from a quotient in f32 that is a
-// few units in the last place off, which the rest puts right. The rest is small (at most 10 n), so its low word is all of it.
-// Rounding to f64 first would change nothing, since between a quotient of such a count and a number halfway between two f32 lie
-// more than 2^-53 of it.
-fn nearest(d: vec2<u32>, n: u32) -> u32 {
-    if (d.x | d.y) == 0u {
-        return 0u;
-    }
-    let by = f32(n);
-    let guess = bitcast<u32>((f32(d.y) * 4294967296.0 + f32(d.x)) / by);
-    var exponent = guess >> 23u;
-    var m = (guess & 0x7fffffu) | 0x800000u;
-    // d / n = m 2^(exponent - 150) and the rest; the quotient of codes is below 2^16, so that d moves to the left.
-    let shift = 150u - exponent;
-    var rest = bitcast<i32>(select(d.x << (shift & 31u), 0u, shift > 31u) - m * n);
-    let off = i32(floor(f32(rest) / by + 0.5));
-    m += u32(off);
+// The f32 nearest to d / n, half to even, of a count n below 2^27 and an integer d below 2^16 n: 26 bits of the quotient from one
+// in f32 that is a few units in the last place off (by way of `inverse`, 1 / n), which the rest puts right. The rest is small (at
+// most 16 n), so its low word is all of it. Rounding to f64 first would change nothing, since between a quotient of such a count and
+// a number halfway between two f32 lie more than 2^-53 of it.
+fn nearest(d: vec2<u32>, n: u32, inverse: f32) -> u32 {
+    let guess = (f32(d.y) * 4294967296.0 + f32(d.x)) * inverse;
+    var exponent = bitcast<u32>(guess) >> 23u;
+    // d / n is about q 2^-shift; it is below 2^16, so that d moves to the left.
+    let shift = 152u - exponent;
+    var q = u32(guess * bitcast<f32>((279u - exponent) << 23u));
+    var rest = i32(select(d.x << (shift & 31u), 0u, shift > 31u) - q * n);
+    let off = i32(floor(f32(rest) * inverse));
+    q += u32(off);
     rest -= off * i32(n);
-    if m < 0x800000u || (m == 0x800000u && rest < 0) {
-        // Below a power of two numbers are half as far apart. m may be as small as 2^23 - 4.
-        m *= 2u;
+    // A quotient next to an integer may have been taken for one on its other side.
+    let low = rest < 0;
+    q -= select(0u, 1u, low);
+    rest += select(0, i32(n), low);
+    let high = rest >= i32(n);
+    q += select(0u, 1u, high);
+    rest -= select(0, i32(n), high);
+    if q < 0x2000000u {
+        // Below a power of two numbers are half as far apart. q is a few units below it at most.
         rest *= 2;
+        q = 2u * q + select(0u, 1u, rest >= i32(n));
+        rest -= select(0, i32(n), rest >= i32(n));
         exponent -= 1u;
     }
-    var unit = i32(n);
-    if m > 0x1000000u || (m == 0x1000000u && rest >= 0) {
+    q |= select(0u, 1u, rest != 0);
+    if q > 0x3ffffffu {
         // And from one on twice as far.
-        rest += select(0, i32(n), (m & 1u) == 1u);
-        unit *= 2;
-        m /= 2u;
+        q = (q >> 1u) | (q & 1u);
         exponent += 1u;
     }
-    let odd = (m & 1u) == 1u;
-    m += select(0u, 1u, 2 * rest > unit || (2 * rest == unit && odd));
-    m -= select(0u, 1u, 2 * rest < -unit || (2 * rest == -unit && odd));
-    // The leading bit adds one to the exponent.
-    return m + ((exponent - 1u) << 23u);
+    // The lowest of the two bits that go stands for the rest, too; the leading bit adds one to the exponent.
+    let m = (q + 1u + ((q >> 2u) & 1u)) >> 2u;
+    return select(m + ((exponent - 1u) << 23u), 0u, (d.x | d.y) == 0u);
 }
 
 // The mean of values that are not scaled, as f32.
 fn plain_mean(w: Window) -> u32 {
+    var inverse = p.inverse;
+    if w.n != p.whole {
+        inverse = 1.0 / f32(w.n);
+    }
     if p.flip == 0u {
-        return nearest(w.s1, w.n);
+        return nearest(w.s1, w.n, inverse);
     }
     let shift = times32(w.n, p.flip);
     if less64(w.s1, shift) {
-        return SIGN | nearest(minus64(shift, w.s1), w.n);
+        return SIGN | nearest(minus64(shift, w.s1), w.n, inverse);
     }
-    return nearest(minus64(w.s1, shift), w.n);
+    return nearest(minus64(w.s1, shift), w.n, inverse);
 }
 
 fn mean(w: Window) -> vec2<u32> {
@@ -327,13 +335,18 @@ fn finish(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) grou
         let x = thread % p.out_x;
         let first = (thread / p.out_x) % p.strips * STRIP;
         let z = thread / (p.out_x * p.strips);
+        var across = 0u;
+        if (parts & 16u) != 0u {
+            across = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_x + x, p.radius_x, p.size_x);
+        }
         for (var y = first; y < min(first + STRIP, p.out_y); y += 1u) {
-            finish_at(z, y, x);
+            finish_at((z * p.out_y + y) * p.out_x + x, window_at(z, y, x, across));
         }
     }
 }
 
-fn finish_at(z: u32, y: u32, x: u32) {
+// What is there of a window; `across`: its voxels in a row along y.
+fn window_at(z: u32, y: u32, x: u32, across: u32) -> Window {
     let voxel = (z * p.out_y + y) * p.out_x + x;
     let index = p.centre + z * p.in_z + y * p.in_y + x;
     var w = Window();
@@ -341,8 +354,7 @@ fn finish_at(z: u32, y: u32, x: u32) {
         w.v = unpacked(voxels[index >> p.packing], index, p.packing) ^ p.flip;
     }
     if (parts & 16u) != 0u {
-        w.n = along(p.at_z + z, p.radius_z, p.size_z) * along(p.at_y + y, p.radius_y, p.size_y)
-            * along(p.at_x + x, p.radius_x, p.size_x);
+        w.n = across * along(p.at_y + y, p.radius_y, p.size_y);
     }
     if (p.needs & 4u) != 0u {
         w.lo = extremes[voxel] & 0xffffu;
@@ -350,7 +362,7 @@ fn finish_at(z: u32, y: u32, x: u32) {
     }
     if (p.needs & 1u) != 0u {
         w.s1 = vec2<u32>(sums[voxel], 0u);
-        if (p.wide & 1u) != 0u {
+        if (parts & 64u) != 0u && (p.wide & 1u) != 0u {
             w.s1 = vec2<u32>(sums[2u * voxel], sums[2u * voxel + 1u]);
         }
     }
@@ -359,6 +371,17 @@ fn finish_at(z: u32, y: u32, x: u32) {
         if (p.wide & 2u) != 0u {
             w.s2 = vec2<u32>(squares[2u * voxel], squares[2u * voxel + 1u]);
         }
+    }
+    return w;
+}
+
+fn finish_at(voxel: u32, window: Window) {
+    if (parts & 32u) == 0u {
+        output[voxel] = plain_mean(window);
+        return;
+    }
+    var w = window;
+    if (parts & 2u) != 0u && (p.needs & 2u) != 0u {
         w.numerator = numerator(w);
     }
     if (parts & 1u) != 0u && (p.needs & 8u) != 0u {

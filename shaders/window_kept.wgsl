@@ -1,6 +1,5 @@
 // Outputs that are kept as they are, one element each.
 
-@group(0) @binding(1) var<storage, read> input: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<Seen>;
 
 fn kept(place: u32) -> Seen {

@@ -3,7 +3,10 @@
 //
 // Agrees with src/kernel/window/float.rs bit for bit (extremes; the host undoes the codes).
 // Bindings, group 0: 0 uniform Pass; 1 storage, read: bits of f32 (`first`) or words of pairs (`next`); 2 storage, read and
-// written: pairs, least and greatest. Workgroup: window_pass.wgsl.
+// written: pairs, least and greatest. Workgroup: window_pass.wgsl, window_tiles.wgsl,
+// window_thirds.wgsl.
+
+@group(0) @binding(1) var<storage, read> input: array<u32>;
 
 const COLUMNS: u32 = 8u;
 

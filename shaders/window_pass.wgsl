@@ -1,5 +1,4 @@
-// What the passes over windows share: their parameters, and which part of which line a thread takes. A
-// shader adds `walk`, which makes the outputs of one block of one line; lines along x go by tiles (window_tiles.wgsl).
+// The parameters of passes over windows.
 //
 // Parameters: src/gpu/passes.rs, struct Pass. Workgroup: 64 x 1 x 1, groups counted over x, then y. No atomics: an output has
 // one writer at a time.
@@ -32,21 +31,3 @@ struct Pass {
 }
 
 @group(0) @binding(0) var<uniform> p: Pass;
-
-// Where a thread's line starts in the input and the output, and the number of its block.
-struct Line {
-    input: u32,
-    output: u32,
-    block: i32,
-}
-
-fn line_of(thread: u32) -> Line {
-    let i = thread % p.lines;
-    let b = (thread / p.lines) % p.blocks;
-    let j = thread / (p.lines * p.blocks);
-    return Line(i * p.in_i + j * p.in_j, i * p.out_i + j * p.out_j, i32(b));
-}
-
-fn one(thread: u32, first_pass: bool) {
-    walk(line_of(thread), first_pass);
-}

@@ -1,49 +1,46 @@
-// Running sums of windows along one axis. Each thread makes one block of outputs of a line with a running sum, which drifts
+// Running sums of windows along z or y. Each thread makes one block of outputs of a line with a running sum, which drifts
 // nowhere since integers wrap exactly; it starts with a whole window, and blocks are at least as long as windows, so the
-// work per output stays below three loads whatever the radius. A shader adds the type `Sum`, its `plus`, `minus` and `term`.
+// work per output stays below three loads whatever the radius. A shader adds the type `Sum`, its `plus`, `minus`, `term`, and
+// the bindings.
 
-@group(0) @binding(1) var<storage, read> input: array<u32>;
-@group(0) @binding(2) var<storage, read_write> output: array<Sum>;
-
-// A packed voxel's code, or its square.
-fn code(index: u32) -> u32 {
-    let code = unpacked(input[index >> p.packing], index, p.packing) ^ p.flip;
-    return select(code, code * code, p.square == 1u);
+// Voxel q of a line from the start of window 0 on, or nothing where there is none.
+fn voxel(line: Line, q: i32, packed: bool) -> Sum {
+    // One before the first wraps to beyond the last.
+    let i = u32(q + p.first);
+    return select(Sum(), term(line.input + min(i, p.n - 1u) * p.in_axis, packed), i < p.n);
 }
 
+// What output k has more than the one before it.
+fn moved(line: Line, k: i32, packed: bool) -> Sum {
+    return minus(voxel(line, k + i32(p.window) - 1, packed), voxel(line, k - 1, packed));
+}
+
+// Four at a time, since nothing is read ahead of what is written.
 fn walk(line: Line, packed: bool) {
-    // q counts voxels from the start of window 0: output k sees q in k .. k + w, of which begin .. end exist.
     let w = i32(p.window);
-    let begin = max(-p.first, 0);
-    let end = i32(p.n) - p.first;
     let start = line.block * i32(p.block);
     let last = min(start + i32(p.block), i32(p.m));
     var sum = Sum();
-    for (var q = max(start, begin); q < min(start + w, end); q += 1) {
-        sum = plus(sum, term(line.input + u32(q + p.first) * p.in_axis, packed));
+    for (var q = start; q < start + w; q += 1) {
+        sum = plus(sum, voxel(line, q, packed));
     }
-    output[line.output + u32(start) * p.out_axis] = sum;
-    if start >= begin && last + w - 1 <= end {
-        // All windows of the block are whole.
-        var gone = line.input + u32(start + p.first) * p.in_axis;
-        var come = gone + p.window * p.in_axis;
-        var to = line.output + u32(start) * p.out_axis;
-        for (var k = start + 1; k < last; k += 1) {
-            to += p.out_axis;
-            sum = minus(plus(sum, term(come, packed)), term(gone, packed));
-            output[to] = sum;
-            come += p.in_axis;
-            gone += p.in_axis;
+    var to = line.output + u32(start) * p.out_axis;
+    output[to] = sum;
+    for (var k = start + 1; k < last; k += 4) {
+        let a = plus(sum, moved(line, k, packed));
+        let b = plus(a, moved(line, k + 1, packed));
+        let c = plus(b, moved(line, k + 2, packed));
+        sum = plus(c, moved(line, k + 3, packed));
+        output[to + p.out_axis] = a;
+        if k + 1 < last {
+            output[to + 2u * p.out_axis] = b;
         }
-        return;
-    }
-    for (var k = start + 1; k < last; k += 1) {
-        if k + w - 1 < end {
-            sum = plus(sum, term(line.input + u32(k + w - 1 + p.first) * p.in_axis, packed));
+        if k + 2 < last {
+            output[to + 3u * p.out_axis] = c;
         }
-        if k - 1 >= begin {
-            sum = minus(sum, term(line.input + u32(k - 1 + p.first) * p.in_axis, packed));
+        if k + 3 < last {
+            output[to + 4u * p.out_axis] = sum;
         }
-        output[line.output + u32(k) * p.out_axis] = sum;
+        to += 4u * p.out_axis;
     }
 }

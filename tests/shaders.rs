@@ -67,7 +67,7 @@ fn every_shader_is_valid() {
                 failures += &format!("{name}: binding {k} is not for {access}\n");
             }
         }
-        let goes_on = shader.text().contains("thread += all_threads(groups)");
+        let goes_on = shader.text().contains("+= all_threads(groups)");
         if (0..shader.entries().len()).any(|e| shader.goes_on(e)) != goes_on {
             failures += &format!("{name}: whether its threads go on\n");
         }

@@ -1,6 +1,7 @@
 //! What windows see beyond the volume, made on the device, so that steps with any border read what others read.
 
 use super::levels::Slab;
+use super::passes;
 use super::points::Read;
 use super::record::Shader;
 use super::recorder::Recorder;
@@ -38,7 +39,7 @@ impl Beyond {
         }
         let (slab, [nz, ny, nx]) = (read.slab, wanted.shape());
         let packing = [2u32, 1, 0, 0][read.stored.voxel - 1];
-        let words = nx.div_ceil(1 << packing);
+        let words = passes::pitch(nx, read.stored.voxel) >> packing;
         let threads = nz * ny * words;
         let made = to.take(threads as u64 * 4);
         let [_, plane, row] = slab.start(&slab.region);

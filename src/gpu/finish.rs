@@ -35,7 +35,7 @@ pub struct Finish {
 
 /// The same for windows of small integers; `struct Codes` of `shaders/window_codes.wgsl`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Codes {
     pub out: [u32; 2],
     pub centre: u32,
@@ -59,6 +59,8 @@ pub struct Codes {
     pub share: [u32; 2],
     pub slope: [u32; 2],
     pub intercept: [u32; 2],
+    pub inverse: f32,
+    pub spare: [u32; 3],
     pub channels: [u32; MOST],
 }
 
@@ -173,6 +175,8 @@ impl Channels {
             share: bits(1.0 / whole as f64),
             slope: bits(self.affine.slope),
             intercept: bits(self.affine.intercept),
+            inverse: 1.0 / whole as f32,
+            spare: [0; 3],
             channels: self.codes,
         };
         let [extremes, sums, squares] = [
@@ -184,7 +188,9 @@ impl Channels {
         let exact = mean || scaled || self.asks(&[3, 4, 5]);
         let spread = [7, 8, 9].iter().any(|c| self.asks(&[*c, c + 256]));
         let power = self.asks(&[6, 262]);
-        let parts = [exact, job.needs.variance, power, spread, job.needs.mean || job.needs.variance];
+        let counted = job.needs.mean || job.needs.variance;
+        let other = exact || self.codes[..self.count] != [0];
+        let parts = [exact, job.needs.variance, power, spread, counted, other, wide(false)];
         to.only(parts.iter().enumerate().map(|(k, part)| (*part as u32) << k).sum());
         planes
     }

@@ -7,7 +7,7 @@ use super::extend::Beyond;
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
 use super::masks::Mask;
-use super::passes::stored;
+use super::passes::{self, stored};
 use super::points::{LOOKED, Op};
 use super::record::{Bind, Buffer, Recording, Sizes, rounded};
 use super::recorder::Recorder;
@@ -176,7 +176,7 @@ impl Flow {
         let own = |sink: &Sink| Some(sink.region.clip(region)).filter(|r| !r.is_empty());
         let Some((source, boxes)) = self.boxes(own) else { return Ok(None) };
         let kind = stored(self.dtype).ok_or(Unfit::Kernel)?;
-        let pitch = source.shape()[2].next_multiple_of(4 / kind.voxel);
+        let pitch = passes::pitch(source.shape()[2], kind.voxel);
         let mut bytes = rounded((source.shape()[0] * source.shape()[1] * pitch * kind.voxel) as u64);
         let mut masks = Vec::new();
         for (step, region) in boxes.iter().enumerate().filter(|(s, _)| self.steps[*s].fills.is_some()) {

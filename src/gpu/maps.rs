@@ -2,7 +2,7 @@
 //! engine. Boxes are counted from the start of the map's region.
 
 use super::levels::{Codes, MAP_KINDS, Slab};
-use super::passes::{largest, packed, parts_within};
+use super::passes::{self, largest, packed, parts_within};
 use super::record::{Bind, Buffer, Recording, Shader, Sizes};
 use super::recorder::Recorder;
 use crate::grid::{Affine, DType, Region, Shape};
@@ -127,7 +127,7 @@ impl MapJob {
 
     /// Voxels per packed row of a part, a whole number of words.
     pub fn pitch(&self, read: Region) -> usize {
-        read.shape()[2].next_multiple_of(4 / self.voxel)
+        passes::pitch(read.shape()[2], self.voxel)
     }
 
     fn sizes(&self, part: Region) -> Sizes {

@@ -35,9 +35,13 @@ pub struct Pass {
     pub spare: [u32; 4],
 }
 
-/// Outputs along x that a workgroup makes of a row, or as many whole blocks as they hold: what it reads beyond them is a sixth of
-/// them at radius 10.
+/// Outputs along z or y that a thread sums at least. Along z of u8 and of u16 at radius 2: 38 and 42 us of 256^3, with 32: 39 and
+/// 48 (H200, 2026-11-27).
+const LEAST: u32 = 16;
+/// Outputs along x that a workgroup makes of a row by van Herk, or as many whole blocks as they hold.
 const SPAN: u32 = 128;
+/// Voxels of a row that a workgroup holds to make extremes of; the shader's `HELD`.
+const HELD: u32 = 512;
 
 /// A quantity that the device makes for every window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,6 +61,23 @@ pub enum Quantity {
 }
 
 impl Quantity {
+    /// Whether passes along z and y take four columns at once.
+    fn by_fours(self) -> bool {
+        matches!(self, Quantity::Extremes | Quantity::Sum { wide: false, .. })
+    }
+
+    /// The shader of each axis and its entry, of windows of so many voxels along x.
+    fn shaders(self, window: u32) -> [(Shader, usize); 3] {
+        let near = window <= HELD / 2;
+        match self {
+            Quantity::Extremes => [(Shader::ExtremesZ, 0), (Shader::ExtremesY, 0), (Shader::Extremes, near as usize)],
+            Quantity::Sum { wide: false, .. } => [(Shader::SumsZ, 0), (Shader::SumsY, 0), (Shader::Sums32, 0)],
+            Quantity::Sum { wide: true, .. } => [0, 1, 2].map(|entry| (Shader::Sums64, entry)),
+            Quantity::Order => [0, 1, 2 + near as usize].map(|entry| (Shader::Order, entry)),
+            Quantity::Moments { .. } => [0, 1, 2].map(|entry| (Shader::Moments, entry)),
+        }
+    }
+
     /// Bytes per window.
     pub fn bytes(self) -> u64 {
         match self {
@@ -170,7 +191,7 @@ impl Job {
 
     /// Voxels per packed row, a whole number of words.
     pub fn pitch(&self, part: &Part) -> usize {
-        part.src[2].next_multiple_of(4 / self.voxel)
+        pitch(part.src[2], self.voxel)
     }
 
     pub fn sizes(&self, part: &Part) -> Sizes {
@@ -190,15 +211,18 @@ impl Job {
 
     /// The passes of one quantity over a part: z from packed voxels, then y, then x.
     pub fn passes(&self, part: &Part, quantity: Quantity) -> [Pass; 3] {
-        let ([nz, ny, nx], [mz, my, mx]) = (part.src.map(|n| n as u32), part.dst.map(|n| n as u32));
-        let pitch = self.pitch(part) as u32;
+        let ([_, ny, _], [mz, my, mx]) = (part.src.map(|n| n as u32), part.dst.map(|n| n as u32));
+        let unit = if quantity.by_fours() { 4 } else { 1 };
+        let row = self.row(part, quantity) as u32 / unit;
+        let packed = self.pitch(part) as u32 / unit;
         let axis = |a: usize| {
             let window = 2 * self.radius[a] as u32 + 1;
             let (n, m) = (part.src[a] as u32, part.dst[a] as u32);
             let block = match (quantity, a) {
-                (Quantity::Sum { .. }, 0 | 1) => window.max(32),
-                (Quantity::Sum { .. }, _) => window.max(SPAN),
+                (Quantity::Sum { .. }, 0 | 1) => window.max(LEAST),
+                (Quantity::Sum { .. }, _) => m.max(1), // a row
                 (_, 0 | 1) => window,
+                (Quantity::Extremes | Quantity::Order, _) if window <= HELD / 2 => HELD + 1 - window,
                 _ => window * (SPAN / window).max(1),
             };
             let start = (self.at[a] + part.lo[a]) as i64 - self.radius[a] as i64 - part.from[a] as i64;
@@ -213,21 +237,28 @@ impl Job {
             Pass { n, m, first: start as i32, window, blocks, block, phase, ..Pass::default() }
         };
         let z = Pass {
-            in_axis: ny * pitch,
+            in_axis: ny * packed,
             in_i: 1,
-            in_j: pitch,
-            out_axis: ny * nx,
+            in_j: packed,
+            out_axis: ny * row,
             out_i: 1,
-            out_j: nx,
-            lines: nx,
+            out_j: row,
+            lines: row,
             packing: [2, 1, 0, 0][self.voxel - 1],
             flip: self.flip(),
             ..axis(0)
         };
-        let y =
-            Pass { in_axis: nx, in_i: 1, in_j: ny * nx, out_axis: nx, out_i: 1, out_j: my * nx, lines: nx, ..axis(1) };
-        let x = Pass { in_axis: 1, in_i: nx, out_axis: 1, out_i: mx, lines: my * mz, ..axis(2) };
-        debug_assert!(nz > 0 && mz > 0);
+        let y = Pass {
+            in_axis: row,
+            in_i: 1,
+            in_j: ny * row,
+            out_axis: row,
+            out_i: 1,
+            out_j: my * row,
+            lines: row,
+            ..axis(1)
+        };
+        let x = Pass { in_axis: 1, in_i: row * unit, out_axis: 1, out_i: mx, lines: my * mz, ..axis(2) };
         let (square, words) = match quantity {
             Quantity::Moments { square } => (square, cell(square)),
             Quantity::Sum { square, .. } => (square, 0),
@@ -235,7 +266,18 @@ impl Job {
         };
         let shared = |p: Pass, threads: u32| Pass { threads, square: square as u32, cell: words as u32, ..p };
         let each = |p: Pass, lines: u32| shared(p, p.blocks * p.lines * lines);
-        [each(z, ny), each(y, mz), shared(x, x.blocks * x.lines.div_ceil(GROUP) * GROUP)]
+        // Van Herk takes 64 rows of a span to a workgroup, prefix sums two, the others one.
+        let groups = match quantity.shaders(x.window)[2] {
+            (Shader::Sums32 | Shader::Sums64, _) => x.lines.div_ceil(2),
+            (Shader::Extremes, 0) | (Shader::Order | Shader::Moments, 2) => x.blocks * x.lines.div_ceil(GROUP),
+            _ => x.blocks * x.lines,
+        };
+        [each(z, ny), each(y, mz), shared(x, groups.saturating_mul(GROUP))]
+    }
+
+    /// Elements from row to row of what passes leave along z and y.
+    fn row(&self, part: &Part, quantity: Quantity) -> usize {
+        if quantity.by_fours() { self.pitch(part) } else { part.src[2] }
     }
 
     /// Every quantity of a part, then what comes back, one quantity after the other; or what the device makes of all of
@@ -272,21 +314,19 @@ impl Job {
     /// Every quantity in a buffer of its own, from voxels of which the part's source is all.
     fn made(&self, part: &Part, from: Bind, to: &mut Recorder) -> Vec<(Quantity, Buffer)> {
         let product = |s: Shape| s.iter().map(|&n| n as u64).product::<u64>();
-        let ([_, ny, nx], [mz, my, _]) = (part.src, part.dst);
+        let ([_, ny, _], [mz, my, _]) = (part.src, part.dst);
         let one = |quantity: Quantity| {
-            let shader = match quantity {
-                Quantity::Extremes => Shader::Extremes,
-                Quantity::Sum { wide: false, .. } => Shader::Sums32,
-                Quantity::Sum { wide: true, .. } => Shader::Sums64,
-                Quantity::Order => Shader::Order,
-                Quantity::Moments { .. } => Shader::Moments,
-            };
+            let row = self.row(part, quantity);
             let last = to.take(result_bytes(part, quantity));
-            let [a, b] = [[mz, ny, nx], [mz, my, nx]].map(|s| to.take(product(s) * quantity.bytes()));
+            let [a, b] = [[mz, ny, row], [mz, my, row]].map(|s| to.take(product(s) * quantity.bytes()));
             let [a, b, last] = [a, b, last].map(Bind::from);
-            for (axis, pass) in self.passes(part, quantity).into_iter().enumerate() {
-                let bind = [[from, a], [a, b], [b, last]][axis];
-                to.dispatch(shader, axis, &pass, &bind, pass.threads);
+            let passes = self.passes(part, quantity);
+            let shaders = quantity.shaders(passes[2].window);
+            for ((pass, (shader, entry)), bind) in passes.iter().zip(shaders).zip([[from, a], [a, b], [b, last]]) {
+                to.dispatch(shader, entry, pass, &bind, pass.threads);
+                if shader.has_parts() {
+                    to.only(pass.square + 2 * (pass.packing == 1) as u32);
+                }
             }
             to.give(a.buffer);
             to.give(b.buffer);
@@ -315,6 +355,12 @@ pub fn packed(dtype: DType) -> Option<(usize, bool)> {
         DType::I16 => Some((2, true)),
         _ => None,
     }
+}
+
+/// Voxels from row to row of packed voxels of so many bytes: whole words, and whole fours, since passes over windows take four
+/// columns at once.
+pub fn pitch(extent: usize, voxel: usize) -> usize {
+    if voxel == 4 { extent } else { extent.next_multiple_of(4) }
 }
 
 /// How voxels are uploaded.

@@ -16,24 +16,26 @@ macro_rules! composed {
     };
 }
 
-/// Running sums of windows, of the type of a file.
-macro_rules! sums {
-    ($own:literal) => {
-        composed!("common", "entries", "window_pass", "window_sums", "window_tiles", "window_sums_rows", $own)
-    };
-}
-
 /// Van Herk over windows, of cells that a file keeps, with what else it needs.
 macro_rules! herk {
     ($($more:literal),*; $own:literal) => {
-        composed!("common", $($more,)* "entries", "window_pass", "window_herk", "window_tiles", "window_herk_rows", $own)
+        composed!(
+            "common", "entry_first", "entry_next", "window_pass", "window_lines", "window_herk", "window_tiles", "window_herk_rows",
+            $($more,)* $own
+        )
     };
 }
 
 /// The shaders, each with its text and entry points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Shader {
+    ExtremesZ,
+    ExtremesY,
+    /// Along x.
     Extremes,
+    SumsZ,
+    SumsY,
+    /// Along x.
     Sums32,
     Sums64,
     /// Of codes of 8 and 16 bits.
@@ -41,6 +43,8 @@ pub enum Shader {
     /// Of codes of 32 bits.
     ObscuranceWide,
     Gaussian,
+    /// Along x.
+    GaussianRows,
     Gradient,
     Order,
     Moments,
@@ -59,13 +63,18 @@ pub enum Shader {
 }
 
 impl Shader {
-    pub const ALL: [Shader; 21] = [
+    pub const ALL: [Shader; 26] = [
+        Shader::ExtremesZ,
+        Shader::ExtremesY,
         Shader::Extremes,
+        Shader::SumsZ,
+        Shader::SumsY,
         Shader::Sums32,
         Shader::Sums64,
         Shader::Obscurance,
         Shader::ObscuranceWide,
         Shader::Gaussian,
+        Shader::GaussianRows,
         Shader::Gradient,
         Shader::Order,
         Shader::Moments,
@@ -85,23 +94,120 @@ impl Shader {
 
     fn composed(self) -> Composed {
         match self {
-            Shader::Extremes => herk!("window_kept"; "window_extremes"),
-            Shader::Sums32 => sums!("window_sums32"),
-            Shader::Sums64 => sums!("window_sums64"),
+            Shader::ExtremesZ => composed!(
+                "common",
+                "entry_first",
+                "window_pass",
+                "window_lines",
+                "window_herk",
+                "window_kept",
+                "window_fours_packed",
+                "window_extremes_four",
+                "window_extremes_z"
+            ),
+            Shader::ExtremesY => composed!(
+                "common",
+                "entry_next",
+                "window_pass",
+                "window_lines",
+                "window_herk",
+                "window_kept",
+                "window_extremes_four",
+                "window_extremes_left",
+                "window_extremes_y"
+            ),
+            Shader::Extremes => composed!(
+                "common",
+                "window_pass",
+                "window_tiles",
+                "window_herk_rows",
+                "window_thirds",
+                "window_kept",
+                "window_extremes_left",
+                "window_extremes"
+            ),
+            Shader::SumsZ => composed!(
+                "common",
+                "entry_first",
+                "window_pass",
+                "window_lines",
+                "window_sums",
+                "window_sums_plain",
+                "window_fours_packed",
+                "window_sums_z"
+            ),
+            Shader::SumsY => {
+                composed!(
+                    "common",
+                    "entry_next",
+                    "window_pass",
+                    "window_lines",
+                    "window_sums",
+                    "window_sums_plain",
+                    "window_sums_left",
+                    "window_sums_y"
+                )
+            }
+            Shader::Sums32 => composed!(
+                "common",
+                "window_pass",
+                "window_scan",
+                "window_sums_plain",
+                "window_sums_left",
+                "window_sums32"
+            ),
+            Shader::Sums64 => composed!(
+                "common",
+                "entry_first",
+                "entry_next",
+                "window_pass",
+                "window_lines",
+                "window_sums",
+                "window_scan",
+                "window_sums64"
+            ),
             Shader::Obscurance => composed!("common", "obscurance_narrow", "obscurance"),
             Shader::ObscuranceWide => composed!("common", "obscurance_wide", "obscurance"),
-            Shader::Gaussian => composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian"),
+            Shader::Gaussian => composed!(
+                "common",
+                "floats",
+                "pairs",
+                "cells",
+                "entry_first",
+                "entry_next",
+                "gaussian_taps",
+                "gaussian_centres",
+                "gaussian_mean",
+                "gaussian"
+            ),
+            Shader::GaussianRows => {
+                composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_mean", "gaussian_rows")
+            }
             Shader::Gradient => composed!("common", "gradient"),
-            Shader::Order => herk!("window_kept"; "window_order"),
+            Shader::Order => herk!("window_thirds", "window_kept"; "window_order"),
             Shader::Moments => herk!("floats", "pairs"; "window_moments"),
             Shader::GaussianVariance => {
-                composed!("common", "floats", "pairs", "cells", "entries", "gaussian_taps", "gaussian_variance")
+                composed!(
+                    "common",
+                    "floats",
+                    "pairs",
+                    "cells",
+                    "entry_first",
+                    "entry_next",
+                    "gaussian_taps",
+                    "gaussian_centres",
+                    "gaussian_variance"
+                )
             }
-            Shader::MapPool => composed!("common", "floats", "pairs", "cells", "entries", "map_pool"),
+            Shader::MapPool => composed!("common", "floats", "pairs", "cells", "entry_first", "entry_next", "map_pool"),
             Shader::Finish => composed!("common", "floats", "pairs", "estimators", "window_finish"),
             Shader::Codes => composed!("common", "integers64", "double", "estimators", "window_codes"),
-            Shader::LevelPool => composed!("common", "integers64", "double", "entries", "level_cells", "level_pool"),
-            Shader::LevelWrite => composed!("common", "integers64", "double", "entries", "level_cells", "level_write"),
+            Shader::LevelPool => {
+                composed!("common", "integers64", "double", "entry_first", "entry_next", "level_cells", "level_pool")
+            }
+            Shader::LevelWrite => {
+                composed!("common", "integers64", "double", "entry_first", "entry_next", "level_cells", "level_write")
+            }
             Shader::Point => composed!("common", "integers64", "double", "point"),
             Shader::Marks => composed!("common", "marks"),
             Shader::Masked => composed!("common", "masked"),
@@ -136,9 +242,13 @@ impl Shader {
             Shader::Extend => &["extend"],
             Shader::SweepCodes => &["code"],
             Shader::Copy => &["copy"],
-            Shader::Extremes | Shader::Sums32 | Shader::Sums64 | Shader::Order | Shader::Moments => {
-                &["first", "next", "rows"]
-            }
+            Shader::ExtremesZ | Shader::SumsZ => &["first"],
+            Shader::ExtremesY | Shader::SumsY => &["next"],
+            Shader::GaussianRows => &["rows"],
+            Shader::Extremes => &["rows", "near"],
+            Shader::Sums32 => &["rows"],
+            Shader::Sums64 | Shader::Moments => &["first", "next", "rows"],
+            Shader::Order => &["first", "next", "rows", "near"],
             _ => &["first", "next"],
         }
     }
@@ -146,13 +256,17 @@ impl Shader {
     /// Whether `parts`, an overridable constant of it, says what is compiled: what nobody asks for takes registers, and threads
     /// off the device.
     pub fn has_parts(self) -> bool {
-        self == Shader::Codes
+        matches!(self, Shader::Codes | Shader::SumsZ | Shader::ExtremesZ)
     }
 
     /// Whether a thread of this entry that has done its work goes on to the next, as many threads on as there are.
     pub fn goes_on(self, entry: usize) -> bool {
         let alone = matches!(self, Shader::Codes | Shader::Finish | Shader::Point | Shader::Gradient | Shader::Copy);
-        alone || matches!(self.entries()[entry], "first" | "next")
+        match self.entries()[entry] {
+            "first" | "next" | "near" => true,
+            "rows" => matches!(self, Shader::Sums32 | Shader::Sums64 | Shader::GaussianRows),
+            _ => alone,
+        }
     }
 
     /// Storage bindings after the uniform one.
@@ -160,7 +274,9 @@ impl Shader {
         match self {
             Shader::Codes | Shader::Point => 5,
             Shader::Obscurance | Shader::ObscuranceWide | Shader::Finish | Shader::LevelPool => 4,
-            Shader::Gaussian | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => 3,
+            Shader::Gaussian | Shader::GaussianRows | Shader::GaussianVariance | Shader::Gradient | Shader::MapPool => {
+                3
+            }
             _ => 2,
         }
     }

@@ -1,7 +1,7 @@
 //! Gradients: how a brick is cut into parts that fit the device, the table of weights, and the one dispatch. Pure
 //! arithmetic, shared by planner and engine.
 
-use super::passes::{Part, largest, parts_within, stored};
+use super::passes::{self, Part, largest, parts_within, stored};
 use super::record::{Bind, Buffer, Recording, Shader, Sizes};
 use super::recorder::{Planes, Recorder};
 use crate::grid::{DType, Shape};
@@ -105,7 +105,7 @@ impl SlopesJob {
 
     /// Voxels per packed row, a whole number of words.
     pub fn pitch(&self, part: &Part) -> usize {
-        part.src[2].next_multiple_of(4 / self.voxel)
+        passes::pitch(part.src[2], self.voxel)
     }
 
     /// Whether a window may be left to the CPU.

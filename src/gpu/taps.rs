@@ -1,8 +1,8 @@
 //! Gaussian means and variances: how a brick is cut into parts that fit the device, the table of weights, and one pass per
 //! axis of each. Pure arithmetic, shared by planner and engine.
 
-use super::passes::{Part, largest, packed, parts_within};
-use super::record::{Bind, Buffer, Recording, Shader, Sizes};
+use super::passes::{self, Part, largest, packed, parts_within};
+use super::record::{Bind, Buffer, GROUP, Recording, Shader, Sizes};
 use super::recorder::Recorder;
 use crate::grid::{DType, Shape};
 use crate::kernel::gaussian;
@@ -56,7 +56,10 @@ pub struct Wanted {
 /// A moment and the shader that makes it.
 const MEAN: Shader = Shader::Gaussian;
 /// Outputs of a thread of the mean; the shader's vectors.
-const STRIP: usize = 4;
+const STRIP: usize = 8;
+/// Steps along x up to which workgroups hold rows, and outputs that they hold them for; the shader's.
+const MOST_STEPS: usize = 128;
+const PART: usize = 256;
 const VARIANCE: Shader = Shader::GaussianVariance;
 
 impl TapsJob {
@@ -92,7 +95,7 @@ impl TapsJob {
 
     /// Voxels per packed row, a whole number of words.
     pub fn pitch(&self, part: &Part) -> usize {
-        part.src[2].next_multiple_of(4 / self.voxel)
+        passes::pitch(part.src[2], self.voxel)
     }
 
     fn sizes(&self, part: &Part) -> Sizes {
@@ -171,7 +174,9 @@ impl TapsJob {
         let mut extent = part.src;
         for (entry, axis) in [(0, 2), (1, 1), (1, 0)] {
             extent[axis] = part.dst[axis];
-            let strip = if shader == MEAN { STRIP } else { 1 };
+            // Held rows are the first pass.
+            let held = axis == 2 && shader == MEAN && self.radius[axis] <= MOST_STEPS;
+            let strip = if shader == MEAN && !held { STRIP } else { 1 };
             let mut threads = extent;
             threads[axis] = extent[axis].div_ceil(strip);
             let next = [extent[1] * extent[2], extent[2], 1];
@@ -199,7 +204,13 @@ impl TapsJob {
             };
             let input = [Bind::from(b), a.into(), from][axis];
             let bind = [input, [last, b, a][axis].into(), Buffer::Tables.into()];
-            to.dispatch(shader, entry, &taps, &bind, taps.threads);
+            if held {
+                let rows = (extent[0] * extent[1]) as u32;
+                let threads = rows.saturating_mul(extent[2].div_ceil(PART) as u32).saturating_mul(GROUP);
+                to.dispatch(Shader::GaussianRows, 0, &Taps { inner: rows, threads, ..taps }, &bind, threads);
+            } else {
+                to.dispatch(shader, entry, &taps, &bind, taps.threads);
+            }
             strides = next;
         }
         to.give(a);

@@ -158,6 +158,18 @@ fn odd_shapes_radii_beyond_the_volume_scales_and_low_solids() {
     }
 }
 
+/// Longer than what a workgroup holds of a row, by windows up to and beyond what it can hold.
+#[test]
+fn long_rows_and_wide_windows() {
+    let Some(gpu) = adapter() else { return };
+    let shape = [1, 2, 1100];
+    for (name, volume) in hostile(shape).into_iter().filter(|(n, _)| ["noise", "gaps", "specials"].contains(n)) {
+        for radius in [5, 127, 128, 400] {
+            check(&gpu, name, &volume, &whole(shape, [0, 1, radius]));
+        }
+    }
+}
+
 #[test]
 fn variance_of_a_large_mean_is_right() {
     let Some(gpu) = adapter() else { return };

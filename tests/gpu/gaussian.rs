@@ -167,6 +167,21 @@ fn odd_shapes_boxes_inside_and_kernels_beyond_the_volume() {
     }
 }
 
+/// Longer than what a workgroup holds of a row, by kernels up to and beyond what it can hold.
+#[test]
+fn long_rows_and_wide_kernels() {
+    let Some(gpu) = adapter() else { return };
+    let shape = [2, 3, 1100];
+    for dtype in DTYPES {
+        let (name, volume) = fills(dtype, shape).swap_remove(0);
+        for sigma in [2.0, 25.0, 42.5, 43.0, 120.0] {
+            check(&gpu, name, &volume, shape, &whole([0.5, 1.0, sigma], shape));
+        }
+        let inside = Case { at: [1, 1, 77], dst: [1, 2, 600], ..whole([0.5, 1.0, 20.0], shape) };
+        check(&gpu, name, &volume, shape, &inside);
+    }
+}
+
 #[test]
 fn a_brick_beyond_the_limits_is_cut_or_goes_to_the_cpu() {
     let Some(mut gpu) = adapter() else { return };

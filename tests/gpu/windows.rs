@@ -8,6 +8,7 @@ use occlude::kernel::simd::Level;
 use occlude::kernel::window::{Place, WindowOut, window};
 use occlude::stage::{Method, Ties, WindowChannel, WindowParams};
 
+use super::common::hash;
 use super::{adapter, fills};
 
 fn params(radius: [usize; 3]) -> WindowParams {
@@ -82,6 +83,7 @@ fn check(gpu: &Gpu, name: &str, volume: &Voxels, shape: Shape, p: &WindowParams,
     }
 }
 
+const MEAN: WindowChannel = WindowChannel::Mean;
 const DTYPES: [DType; 4] = [DType::U8, DType::I8, DType::U16, DType::I16];
 
 #[test]
@@ -106,6 +108,46 @@ fn odd_shapes_and_radii_beyond_the_volume() {
             for radius in [[1, 0, 2], [3, 3, 3], [100, 100, 100], [0, 1 << 40, 1]] {
                 check(&gpu, name, &volume, shape, &params(radius), ([0; 3], shape));
             }
+        }
+    }
+}
+
+/// Longer than what a workgroup holds of a row, by windows up to and beyond what it can hold.
+#[test]
+fn long_rows_and_wide_windows() {
+    let Some(gpu) = adapter() else { return };
+    let shape = [2, 3, 1100];
+    for dtype in DTYPES {
+        let (name, volume) = fills(dtype, shape).into_iter().find(|(n, _)| *n == "noise").unwrap();
+        for radius in [5, 127, 128, 300, 2000] {
+            check(&gpu, name, &volume, shape, &params([1, 0, radius]), ([0; 3], shape));
+        }
+        check(&gpu, name, &volume, shape, &params([0, 2, 90]), ([1, 1, 77], [1, 2, 600]));
+    }
+}
+
+/// Quotients halfway between two f32, and means next to a power of two, where the nearest f32 change their distance.
+#[test]
+fn means_are_rounded_half_to_even() {
+    let Some(gpu) = adapter() else { return };
+    let shape = [16, 16, 40];
+    let check_means = |volume: &Voxels, radius: [usize; 3]| {
+        let [cpu, got] =
+            [None, Some(&gpu)].map(|g| results(g, volume, shape, &params(radius), ([0; 3], shape), &[MEAN]));
+        assert_eq!(differs(&cpu, &got, &[MEAN]), None, "radius {radius:?}");
+    };
+    // Windows of 512 and of 2048 voxels have sums of more bits than f32 has.
+    let high = Voxels::U16((0..16 * 16 * 40).map(|i| 65535 - (hash(11, i) % 5000) as u16).collect());
+    [[7; 3], [15, 15, 3], [15, 15, 7]].into_iter().for_each(|r| check_means(&high, r));
+    for power in [1u16, 2, 64, 4096, 32768] {
+        for below in [true, false] {
+            let near = |i| match hash(12, i) % 700 {
+                0 if below => power - 1,
+                0 => power + 1,
+                _ => power,
+            };
+            let volume = Voxels::U16((0..16 * 16 * 40).map(near).collect());
+            [[4, 5, 6], [7; 3], [10; 3], [1, 2, 1]].into_iter().for_each(|r| check_means(&volume, r));
         }
     }
 }
