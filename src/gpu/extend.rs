@@ -1,10 +1,10 @@
 //! What windows see beyond the volume, made on the device, so that steps with any border read what others read.
 
 use super::levels::Slab;
-use super::passes;
 use super::points::Read;
 use super::record::Shader;
 use super::recorder::Recorder;
+use super::stored::pitch;
 use crate::grid::{Border, Region};
 
 /// What the dispatch does; `struct Extend` of `shaders/extend.wgsl`, which explains the fields.
@@ -39,7 +39,7 @@ impl Beyond {
         }
         let (slab, [nz, ny, nx]) = (read.slab, wanted.shape());
         let packing = [2u32, 1, 0, 0][read.stored.voxel - 1];
-        let words = passes::pitch(nx, read.stored.voxel) >> packing;
+        let words = pitch(nx, read.stored.voxel) >> packing;
         let threads = nz * ny * words;
         let made = to.take(threads as u64 * 4);
         let [_, plane, row] = slab.start(&slab.region);

@@ -7,11 +7,11 @@ use super::extend::Beyond;
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
 use super::masks::Mask;
-use super::passes::{self, stored};
 use super::points::{LOOKED, Op};
 use super::record::{Bind, Buffer, Recording, Sizes, rounded};
 use super::recorder::Recorder;
 use super::slopes::Fit;
+use super::stored::{pitch, stored};
 use super::sweep::repeated;
 use super::taps::Wanted;
 use super::unfit::{Unfit, cut_to};
@@ -176,7 +176,7 @@ impl Flow {
         let own = |sink: &Sink| Some(sink.region.clip(region)).filter(|r| !r.is_empty());
         let Some((source, boxes)) = self.boxes(own) else { return Ok(None) };
         let kind = stored(self.dtype).ok_or(Unfit::Kernel)?;
-        let pitch = passes::pitch(source.shape()[2], kind.voxel);
+        let pitch = pitch(source.shape()[2], kind.voxel);
         let mut bytes = rounded((source.shape()[0] * source.shape()[1] * pitch * kind.voxel) as u64);
         let mut masks = Vec::new();
         for (step, region) in boxes.iter().enumerate().filter(|(s, _)| self.steps[*s].fills.is_some()) {

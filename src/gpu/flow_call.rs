@@ -3,7 +3,8 @@
 use super::engine::{Gpu, GpuError, Times, run_part};
 use super::flow::{Flow, FlowPart, Sink};
 use super::levels::{EXCLUDED, Placed, Pyramid};
-use super::passes::{Part, stored};
+use super::passes::Part;
+use super::stored::stored;
 use super::windows::{cast, pack};
 use crate::grid::{AnyView, AnyViewMut, Region, Shape, View, Voxel};
 

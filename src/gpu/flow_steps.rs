@@ -2,11 +2,12 @@
 
 use super::flow::{FlowStep, Kernel, State};
 use super::levels::Slab;
-use super::passes::{Job, Part, Stored};
+use super::passes::{Job, Part};
 use super::points::{Op, Read, look};
 use super::record::{Buffer, Shader};
 use super::recorder::{Planes, Recorder};
 use super::slopes::{Fit, Input, SlopesJob};
+use super::stored::Stored;
 use super::sweep::{Keys, SweepJob, SweepPart};
 use super::taps::{TapsJob, Wanted};
 use super::unfit::Unfit;

@@ -2,9 +2,10 @@
 //! engine. Boxes are counted from the start of the map's region.
 
 use super::levels::{Codes, MAP_KINDS, Slab};
-use super::passes::{self, largest, packed, parts_within};
+use super::passes::{largest, parts_within};
 use super::record::{Bind, Buffer, Recording, Shader, Sizes};
 use super::recorder::Recorder;
+use super::stored::{packed, pitch};
 use crate::grid::{Affine, DType, Region, Shape};
 use crate::kernel::convert::Mapping;
 use crate::kernel::occlusion_map::{full_weights, needed};
@@ -127,7 +128,7 @@ impl MapJob {
 
     /// Voxels per packed row of a part, a whole number of words.
     pub fn pitch(&self, read: Region) -> usize {
-        passes::pitch(read.shape()[2], self.voxel)
+        pitch(read.shape()[2], self.voxel)
     }
 
     fn sizes(&self, part: Region) -> Sizes {

@@ -51,6 +51,7 @@ pub mod recorder;
 pub mod shaders;
 pub mod slopes;
 mod slot;
+pub mod stored;
 pub mod sweep;
 pub mod taps;
 mod unfit;

@@ -1,9 +1,9 @@
 //! Steps that look at one voxel, as data: which operation, of which channels, with which constants.
 
 use super::levels::{Slab, words};
-use super::passes::Stored;
 use super::record::{Bind, Buffer, FLAG_BYTES, Shader};
 use super::recorder::Recorder;
+use super::stored::Stored;
 use crate::grid::{Affine, Region};
 use crate::stage::{CombineKind, TransferPoint, WindowMode};
 

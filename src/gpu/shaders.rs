@@ -16,11 +16,11 @@ macro_rules! composed {
     };
 }
 
-/// Van Herk over windows, of cells that a file keeps, with what else it needs.
+/// Van Herk over windows, of cells that a file keeps, with how it goes along z and y and what else it needs.
 macro_rules! herk {
     ($($more:literal),*; $own:literal) => {
         composed!(
-            "common", "entry_first", "entry_next", "window_pass", "window_lines", "window_herk", "window_tiles", "window_herk_rows",
+            "common", "entry_first", "entry_next", "window_pass", "window_lines", "window_tiles", "window_herk_rows",
             $($more,)* $own
         )
     };
@@ -99,7 +99,7 @@ impl Shader {
                 "entry_first",
                 "window_pass",
                 "window_lines",
-                "window_herk",
+                "window_herk_ahead",
                 "window_kept",
                 "window_fours_packed",
                 "window_extremes_four",
@@ -110,7 +110,7 @@ impl Shader {
                 "entry_next",
                 "window_pass",
                 "window_lines",
-                "window_herk",
+                "window_herk_ahead",
                 "window_kept",
                 "window_extremes_four",
                 "window_extremes_left",
@@ -184,8 +184,8 @@ impl Shader {
                 composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_mean", "gaussian_rows")
             }
             Shader::Gradient => composed!("common", "gradient"),
-            Shader::Order => herk!("window_thirds", "window_kept"; "window_order"),
-            Shader::Moments => herk!("floats", "pairs"; "window_moments"),
+            Shader::Order => herk!("window_herk_ahead", "window_thirds", "window_kept"; "window_order"),
+            Shader::Moments => herk!("window_herk", "floats", "pairs"; "window_moments"),
             Shader::GaussianVariance => {
                 composed!(
                     "common",

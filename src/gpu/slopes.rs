@@ -1,9 +1,10 @@
 //! Gradients: how a brick is cut into parts that fit the device, the table of weights, and the one dispatch. Pure
 //! arithmetic, shared by planner and engine.
 
-use super::passes::{self, Part, largest, parts_within, stored};
+use super::passes::{Part, largest, parts_within};
 use super::record::{Bind, Buffer, Recording, Shader, Sizes};
 use super::recorder::{Planes, Recorder};
+use super::stored::{pitch, stored};
 use crate::grid::{DType, Shape};
 use crate::kernel::gradient::shared::{self, Along};
 use crate::stage::GradientWeight;
@@ -105,7 +106,7 @@ impl SlopesJob {
 
     /// Voxels per packed row, a whole number of words.
     pub fn pitch(&self, part: &Part) -> usize {
-        passes::pitch(part.src[2], self.voxel)
+        pitch(part.src[2], self.voxel)
     }
 
     /// Whether a window may be left to the CPU.

@@ -1,9 +1,9 @@
 //! Obscurance: how a brick is cut into parts that fit the device, the tables of displacements and contributions, and one
 //! dispatch (or a few) per family of lines. Pure arithmetic, shared by planner and engine.
 
-use super::passes::{self, Stored};
 use super::record::{Bind, Buffer, GROUP, Recording, Shader, Sizes};
 use super::recorder::Recorder;
+use super::stored::{Stored, pitch};
 use super::unfit::{Unfit, cut_to};
 use crate::grid::{DType, Region, Shape};
 use crate::kernel::obscurance::{Prepared, shared};
@@ -81,7 +81,7 @@ pub struct SweepPart {
 impl SweepPart {
     /// Codes per packed row, a whole number of words.
     pub fn pitch(&self, code: usize) -> usize {
-        passes::pitch(self.src.shape()[2], code)
+        pitch(self.src.shape()[2], code)
     }
 }
 
