@@ -2,12 +2,13 @@
 //! the CPU kernel.
 
 use super::engine::GpuError;
+use super::flow_call::paste;
 use super::pairs::Cell;
 use super::passes::{self, Job, Part, Quantity, result_bytes};
 use super::slopes::MARKED;
 use super::windows::cast;
 use crate::brick::Voxels;
-use crate::grid::{AnyView, AnyViewMut, Region, View, ViewMut, Voxel};
+use crate::grid::{AnyView, AnyViewMut, DType, Region, View, ViewMut, Voxel};
 use crate::kernel::Context;
 use crate::kernel::window::finish_floats::{Moments, finish_floats};
 use crate::kernel::window::{self, Place, WindowOut};
@@ -58,9 +59,11 @@ fn store(results: &[u32], part: &Part, dst: &mut AnyViewMut) {
             row.zip(&results[(z * ny + y) * nx..]).for_each(|(d, r)| *d = cast(*r));
         }
     }
+    if dst.dtype() == DType::F32 {
+        return paste(bytemuck::cast_slice(results), part.dst, part.lo, dst);
+    }
     let results: &[f32] = bytemuck::cast_slice(results);
     match dst {
-        AnyViewMut::F32(d) => rows(d, results, part, |r| r),
         // Extremes of small integers, which f32 holds.
         AnyViewMut::U8(d) => rows(d, results, part, |r| r as u8),
         AnyViewMut::I8(d) => rows(d, results, part, |r| r as i8),

@@ -6,7 +6,7 @@ use super::levels::{EXCLUDED, Placed, Pyramid};
 use super::passes::Part;
 use super::stored::stored;
 use super::windows::{cast, pack};
-use crate::grid::{AnyView, AnyViewMut, Region, Shape, View, Voxel};
+use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, Voxel};
 
 /// Where a sink's results go.
 pub enum SinkOut<'a> {
@@ -144,6 +144,9 @@ pub(super) fn paste(bytes: &[u8], [nz, ny, nx]: Shape, at: [usize; 3], dst: &mut
 fn paste_floats(floats: &[f32], [nz, ny, nx]: Shape, at: [usize; 3], dst: &mut AnyViewMut) {
     fn row<T: Voxel>(to: &mut [T], from: &[f32]) {
         to.iter_mut().zip(from).for_each(|(t, f)| *t = T::from_f64(*f as f64));
+    }
+    if dst.dtype() == DType::F32 {
+        return paste(bytemuck::cast_slice(floats), [nz, ny, nx], at, dst);
     }
     crate::with_view!(AnyViewMut, dst, d => {
         for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {

@@ -78,7 +78,7 @@ pub(super) fn pack(src: AnyView, part: &Part, pitch: usize, out: &mut wgpu::Writ
             for y in 0..part.src[1] {
                 let bytes: &[u8] = bytemuck::cast_slice(v.row_at(z, y));
                 let from = (z * part.src[1] + y) * pitch;
-                // The padding at the end of a row is never read by a shader.
+                // Nothing that is kept is made of the padding at the end of a row.
                 out.slice(from..from + bytes.len()).copy_from_slice(bytes);
             }
         }
