@@ -1,12 +1,9 @@
-// Truncated Gaussian mean along x (gaussian.wgsl), of up to `MOST` steps: a workgroup holds a part of a row with what its
-// windows see beyond it, and each thread makes four outputs, 64 apart.
+// Truncated Gaussian mean along x (gaussian.wgsl), of up to 128 steps: a workgroup holds a part of a row, of 256 outputs, with what
+// its windows see beyond it, and each thread makes four outputs, 64 apart.
 //
 // Agrees bit for bit with src/kernel/gaussian (mean_row in f32).
 // Bindings, group 0: 0 uniform Taps; 1 storage, read: packed voxels; 2 storage, written: bits of f32; 3 storage, read: bits of f32
 // weights, for each step away those of all outputs along the axis. Workgroup: 64 x 1 x 1, groups counted over x, then y.
-
-// Steps on both sides of a part of 256 outputs.
-const MOST: u32 = 128u;
 
 var<workgroup> row_values: array<f32, 512>;
 

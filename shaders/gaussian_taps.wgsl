@@ -1,7 +1,7 @@
 // What Gaussian passes along one axis share: parameters and bindings.
 //
 // Parameters: src/gpu/taps.rs, struct Taps. Weights come from the CPU, in f64 and rounded.
-// Workgroup: 64 x 1 x 1, groups counted over x, then y. No workgroup memory, no atomics: an output has one writer.
+// Workgroup: 64 x 1 x 1, groups counted over x, then y. No atomics: an output has one writer.
 
 struct Taps {
     n: u32,         // extent of the whole source along the axis

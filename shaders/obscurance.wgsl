@@ -60,8 +60,8 @@ const NOT_SWEPT: u32 = 0xffffffffu;
 // Steps of a voxel without a greater code ahead: more than there are planes.
 const NONE: u32 = 0xffffu;
 
-// Links of the chain that a thread has at hand, less one; a power of two. 42 directions over 256^3 u8 took 5.8 ms with 8, 7.0 with 16,
-// which keep threads off the device, 7.4 with 4 (noise; smooth waves 5.5, -, 6.3; H200, 2026-11-27).
+// Links of the chain that a thread has at hand, less one; a power of two. 42 directions over 256^3 u8 took 5.8 ms with 8, 7.0 with
+// 16, which keep threads off the device, 7.4 with 4 (noise; smooth waves 5.5, -, 6.3; H200, 2026-11-27).
 const KEPT: u32 = 8u;
 
 var<private> p: Lines;

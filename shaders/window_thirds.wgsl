@@ -1,5 +1,5 @@
-// Extremes of windows along x, of up to `HELD` / 2 voxels: a workgroup takes a span of a row, makes of it the extremes of windows of
-// 3 voxels, of those 9, and so on, and joins up to three of these for each window. So every voxel is read once, neighbours by
+// Extremes of windows along x, of up to `HELD` / 2 voxels: a workgroup takes a span of a row, makes of it the extremes of windows
+// of 3 voxels, of those 9, and so on, and joins up to three of these for each window. So every voxel is read once, neighbours by
 // neighbours, and the work grows with the logarithm of the radius. A thread has what starts at every 64th voxel at hand.
 
 const HELD: u32 = 512u;

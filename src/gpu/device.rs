@@ -142,8 +142,8 @@ fn kernel(device: &wgpu::Device, kind: Kind) -> Kernel {
     let module = wgpu::ShaderModuleDescriptor { label: Some(name), source };
     // SAFETY: indices come from extents and strides that the recorders make with the sizes of the buffers (a driver that can
     // checks them all the same, and lavapipe does in the tests); every loop of the shaders counts up or down to a bound that does
-    // not change in it (`seek` steps by at least one, and goes down a stack that has an end), so none is endless; every divisor is a constant, or an extent or a count of
-    // the parameters, which recorders keep above 0; there are no rays and no meshes.
+    // not change in it (`seek` steps by at least one, and goes down a stack that has an end), so none is endless; every divisor is a
+    // constant, or an extent or a count of the parameters, which recorders keep above 0; there are no rays and no meshes.
     let module = unsafe { device.create_shader_module_trusted(module, wgpu::ShaderRuntimeChecks::unchecked()) };
     let parts = [("parts", kind.parts as f64)];
     let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
@@ -151,7 +151,7 @@ fn kernel(device: &wgpu::Device, kind: Kind) -> Kernel {
         layout: Some(&shared),
         module: &module,
         entry_point: Some(shader.entries()[kind.entry]),
-        // Nothing in workgroup memory is read before it is written.
+        // Nothing that is kept is made of workgroup memory that was not written before.
         compilation_options: wgpu::PipelineCompilationOptions {
             zero_initialize_workgroup_memory: false,
             constants: if shader.has_parts() { &parts } else { &[] },
