@@ -10,6 +10,7 @@ pyramids alone, in other bricks, and is judged by the channels of the first. The
 first there, byte for byte. Exit code 1 if any case fails; the seed of a failure runs it again.
 """
 
+import functools
 import itertools
 import json
 import multiprocessing
@@ -329,10 +330,10 @@ def campaign(kind, count):
     count = int(sys.argv[3]) if len(sys.argv) > 3 else count
     failed = 0
     with multiprocessing.Pool() as pool:
-        for text in pool.starmap(outcome, [(kind, seed) for seed in range(first, first + count)], 1):
+        for text in pool.imap(functools.partial(outcome, kind), range(first, first + count)):
             failed += bool(text)
             if text:
-                print(text)
+                print(text, flush=True)
     print(f"{count - failed} random configs passed, {failed} failed")
     sys.exit(failed > 0)
 
