@@ -1,5 +1,4 @@
 //! Outputs as users and viewers meet them: paths that cannot be, components, and what a failed deletion leaves.
-#[allow(dead_code)]
 mod common;
 
 use std::fs;
