@@ -70,7 +70,14 @@ impl fmt::Display for Error {
                     }
                     write!(f, ": ")?;
                 }
-                if key.is_empty() { write!(f, "{message}") } else { write!(f, "{key}: {message}") }
+                if key.is_empty() {
+                    return f.write_str(message);
+                }
+                // Keys come from files; what is no character could be a command to a terminal.
+                for c in key.chars() {
+                    if c.is_control() { write!(f, "{}", c.escape_default())? } else { write!(f, "{c}")? }
+                }
+                write!(f, ": {message}")
             }
             Error::File { path, message } => write!(f, "{}: {message}", path.display()),
             Error::Failed(message) => f.write_str(message),

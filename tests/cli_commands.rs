@@ -252,6 +252,11 @@ fn what_planning_refuses_points_at_the_line_of_the_key() {
         ("memory = \"1KiB\"", "region = [[0, 9], [0, 5], [0, 6]]", "c.toml:3: run.region"),
         ("radius = 1", "radius = \"2 mm\"", "c.toml:10: stage.b.radius"),
         ("channel = 0", "channel = 3", "c.toml:6: input.v.channel"),
+        (
+            "from = \"b\"",
+            "from = [\"b.variance\", \"b.std\"]\nreduce = \"moments\"",
+            "c.toml:14: output.o.reduce: \"moments\" is for variances or for standard deviations, not for both in one array",
+        ),
     ] {
         std::fs::write(f.join("c.toml"), text.replace(from, to)).unwrap();
         let (code, _, err) = call(f, &["run", "c.toml"]);

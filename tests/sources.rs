@@ -127,6 +127,28 @@ fn npy_in_both_orders() {
     let (source, voxels) = whole(&fixture("npy/2d.npy"), 0).unwrap();
     assert_eq!(source.info().shape, [1, 5, 6]);
     assert_eq!(voxels.at(7), 40.0 + 7.0 + 1.0);
+    // Three components before z, as outputs of several have them.
+    let folder = tempfile::tempdir().unwrap();
+    let values: Vec<f64> = (0..3).flat_map(|c| (0..120).map(move |i| expected([4, 5, 6], c)(i))).collect();
+    for fortran in [false, true] {
+        let path = folder.path().join(format!("{fortran}.npy"));
+        let head = format!(
+            "{{'descr': '<i4', 'fortran_order': {}, 'shape': (3, 4, 5, 6), }}",
+            ["False", "True"][usize::from(fortran)]
+        );
+        let mut bytes =
+            [b"\x93NUMPY\x01\x00".to_vec(), (head.len() as u16).to_le_bytes().to_vec(), head.into_bytes()].concat();
+        let turned = |i: usize| (i % 3) * 120 + (i / 3 % 4) * 30 + (i / 12 % 5) * 6 + i / 60;
+        (0..360).for_each(|i| bytes.extend((values[if fortran { turned(i) } else { i }] as i32).to_le_bytes()));
+        fs::write(&path, bytes).unwrap();
+        for c in 0..3 {
+            check(&Input { channel: Select::Index(c), ..file_input(&path) }, 0, c);
+            let source = check(&Input { channel: Select::All, ..file_input(&path) }, c, c);
+            assert_eq!(source.info().component_names, ["channel 0", "channel 1", "channel 2"]);
+        }
+        let e = Source::open(&Input { channel: Select::Index(3), ..file_input(&path) }).unwrap_err();
+        assert!(e.to_string().contains("channel: 3 does not exist; the input has 3"), "{e}");
+    }
 }
 
 #[test]

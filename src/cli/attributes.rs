@@ -20,6 +20,8 @@ pub struct Attributes {
     /// Shape and element type of a flat output, which a headerless one cannot say itself.
     pub shape: Option<[usize; 3]>,
     pub dtype: Option<DType>,
+    /// Components of a flat output of several.
+    pub components: Option<usize>,
 }
 
 /// Reads the metadata of a Zarr group or array (v3, then v2), or the file beside a flat output.
@@ -39,7 +41,12 @@ pub fn read(path: &Path) -> Attributes {
     let Some(beside) = json(&Sink::work_dir(path).join("meta.json")) else { return Attributes::default() };
     let sizes = beside.get("shape").and_then(Value::as_array);
     let sizes = sizes.and_then(|s| s.iter().map(|n| n.as_u64().map(|n| n as usize)).collect::<Option<Vec<_>>>());
+    let (components, sizes) = match sizes.as_deref() {
+        Some([c, rest @ ..]) if rest.len() == 3 => (Some(*c), Some(rest)),
+        other => (None, other),
+    };
     Attributes {
+        components,
         shape: sizes.and_then(|s| s.try_into().ok()),
         dtype: beside.get("dtype").and_then(Value::as_str).and_then(DType::parse),
         // An unfinished output has no attribute yet, only the note that it is not complete.
@@ -102,6 +109,7 @@ mod tests {
         put("b.zarr/.zattrs", &json!({"occlude": occlude, "multiscales": multiscales}));
         put("c.nii.occlude/meta.json", &occlude);
         put("d.nii.occlude/meta.json", &json!({"occlude": occlude, "shape": [1, 2, 3], "dtype": "u8"}));
+        put("f.raw.occlude/meta.json", &json!({"occlude": occlude, "shape": [7, 1, 2, 3], "dtype": "f32"}));
         for (name, levels) in [("a.zarr", 2), ("b.zarr", 2), ("c.nii", 0), ("d.nii", 0)] {
             let a = read(&folder.path().join(name));
             assert_eq!(a.value_range(), Some([-1.0, 3.5]), "{name}");
@@ -109,7 +117,9 @@ mod tests {
             assert_eq!(a.datasets.len(), levels, "{name}");
         }
         let d = read(&folder.path().join("d.nii"));
-        assert_eq!((d.shape, d.dtype), (Some([1, 2, 3]), Some(DType::U8)));
+        assert_eq!((d.shape, d.dtype, d.components), (Some([1, 2, 3]), Some(DType::U8), None));
+        let f = read(&folder.path().join("f.raw"));
+        assert_eq!((f.shape, f.dtype, f.components), (Some([1, 2, 3]), Some(DType::F32), Some(7)));
         put("e.zarr/zarr.json", &json!({"attributes": {"occlude": {"value_range": [3, 3], "channels": []}}}));
         let e = read(&folder.path().join("e.zarr"));
         assert_eq!((e.value_range(), e.is_openness(), e.complete()), (None, false, Some(false)));

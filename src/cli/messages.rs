@@ -77,12 +77,14 @@ pub fn interrupts() -> Cancel {
         .clone()
 }
 
-/// Ends quietly when the reader of stdout goes away (`occlude plan | head`), like other command-line programs.
-pub fn restore_sigpipe() {
+/// Ends quietly when the reader of stdout goes away (`occlude plan | head`), like other command-line programs; a limit of file
+/// sizes (`ulimit -f`) is an error of the write that exceeds it, not the end of the process.
+pub fn set_signals() {
     #[cfg(unix)]
-    // SAFETY: called once at the start, before any thread; SIG_DFL is a valid disposition for SIGPIPE.
+    // SAFETY: called once at the start, before any thread; both are valid dispositions.
     unsafe {
         libc::signal(libc::SIGPIPE, libc::SIG_DFL);
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
     }
 }
 

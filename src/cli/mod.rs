@@ -28,7 +28,7 @@ use args::{Cli, Command, ConfigArgs, DeviceArg};
 /// The program: parses the command line, runs the command, returns the exit code (0 done, 1 failed, 2 wrong usage or
 /// config, 130 interrupted).
 pub fn main() -> ExitCode {
-    messages::restore_sigpipe();
+    messages::set_signals();
     messages::hook_panics(std::env::args_os().any(|a| a == "-v" || a == "--verbose"));
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,

@@ -147,17 +147,30 @@ pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attribut
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     let stem = name.strip_suffix(".gz").unwrap_or(&name);
     if raw.shape.is_none() && path.is_file() && (stem.ends_with(".raw") || stem.ends_with(".bin")) {
-        let message = format!("{} is headerless; expected --shape Z,Y,X and --dtype beside it", path.display());
+        let message = match (attributes.components, attributes.shape, attributes.dtype) {
+            // One after the other, which is a volume of as many planes.
+            (Some(c), Some([z, y, x]), Some(dtype)) => format!(
+                "{} holds {c} components of {z} x {y} x {x} voxels, one after the other; expected --shape {},{y},{x} --dtype {dtype}",
+                path.display(),
+                c * z
+            ),
+            _ => format!("{} is headerless; expected --shape Z,Y,X and --dtype beside it", path.display()),
+        };
         return Err(usage("--shape", message));
     }
-    input(path, level, &raw)
+    let mut input = input(path, level, &raw)?;
+    if attributes.components.is_some() {
+        // NIfTI keeps the components of an output as times.
+        input.time = Select::All;
+    }
+    Ok(input)
 }
 
 /// A headerless output of this program: shape and type stand in the file beside it.
 fn describe(path: &Path, given: &RawArgs, attributes: &Attributes) -> RawArgs {
     let raw_name = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("raw"));
     match (attributes.shape, given.dtype.or(attributes.dtype)) {
-        (Some(shape), Some(dtype)) if raw_name && given.shape.is_none() => {
+        (Some(shape), Some(dtype)) if raw_name && given.shape.is_none() && attributes.components.is_none() => {
             RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() }
         }
         _ => given.clone(),

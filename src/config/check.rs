@@ -173,7 +173,17 @@ fn paths(config: &Config) -> Result<()> {
     for (i, output) in config.outputs.iter().enumerate() {
         let path = &outputs[i];
         let refuse = |message: String| Err(output.place.error("path", format!("got {:?}; {message}", output.path)));
+        if let Some(file) = path.ancestors().skip(1).find(|p| p.exists()).filter(|p| !p.is_dir()) {
+            return refuse(format!("{} is a file; expected a path whose folders are, or can be made", file.display()));
+        }
+        let beside = work_folder(path);
         for (name, input) in &inputs {
+            if input.starts_with(&beside) {
+                return refuse(format!(
+                    "input {name:?} lies in {}, where its run keeps what is unfinished",
+                    beside.display()
+                ));
+            }
             if path == input {
                 return refuse(format!("it is the path of input {name:?}; expected another one"));
             }
@@ -185,6 +195,10 @@ fn paths(config: &Config) -> Result<()> {
             }
         }
         for (j, other) in outputs[..i].iter().enumerate() {
+            if path.starts_with(work_folder(other)) || other.starts_with(&beside) {
+                let name = &config.outputs[j].name;
+                return refuse(format!("a folder NAME.occlude beside an output is its own; see output {name:?}"));
+            }
             if path == other {
                 return refuse(format!("output {:?} has the same path; expected another one", config.outputs[j].name));
             }
@@ -197,6 +211,13 @@ fn paths(config: &Config) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// The folder beside an output in which sinks keep what is unfinished.
+fn work_folder(path: &Path) -> PathBuf {
+    let mut name = path.file_name().unwrap_or_default().to_os_string();
+    name.push(".occlude");
+    path.with_file_name(name)
 }
 
 /// Absolute, without `.` and `..`, links in the part that exists followed.

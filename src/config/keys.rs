@@ -181,7 +181,7 @@ pub const KEYS: &[Key] = &[
     stage(&["window"], "high", Kind::AnyNumber, Required, "openness above it becomes 1"),
     stage(&["window"], "mode", Kind::Choice(&["keep", "stretch"]), Toml("\"keep\""), "what happens in between"),
     stage(&["opacity_modulation"], "by", Kind::Ref, Required, "a variance or a saliency"),
-    stage(&["opacity_modulation"], "sigma_max2", Kind::Number { min: 0.0, strict: true }, Toml("5.0"), "by a variance: opacity times min(by / sigma_max2, 1)"),
+    stage(&["opacity_modulation"], "sigma_max2", Kind::Number { min: 0.0, strict: true }, Toml("5.0"), "by a variance: opacity times min(by / sigma_max2, 1); a negative by counts as 0"),
     stage(&["opacity_modulation"], "threshold", Kind::AnyNumber, Toml("0.2"), "by a saliency: opacity is 0 below it"),
     stage(&["opacity_modulation"], "gain", Kind::Number { min: 0.0, strict: false }, Toml("1.0"), "by a saliency: factor"),
     stage(REGRESSION, "size", Kind::Size, Toml("5"), "voxels per axis of the regression: 5 or 3"),

@@ -34,9 +34,14 @@ pub struct Place {
 impl Place {
     /// A config error at `key` of this thing (`""`: at the thing itself). The file is added by [`crate::Error::located`].
     pub fn error(&self, key: &str, message: impl std::fmt::Display) -> crate::Error {
-        let line = self.lines.iter().find(|(k, _)| k == key).map(|(_, line)| *line).or(self.line);
+        let line = self.line_of(key);
         let dotted = if key.is_empty() { self.key.clone() } else { format!("{}.{key}", self.key) };
         crate::Error::Config { file: None, line, key: dotted, message: message.to_string() }
+    }
+
+    /// The line of one of its keys, else its own.
+    pub fn line_of(&self, key: &str) -> Option<usize> {
+        self.lines.iter().find(|(k, _)| k == key).map(|(_, line)| *line).or(self.line)
     }
 }
 

@@ -1,9 +1,11 @@
 //! The dataflow graph by index: wires (one channel each) and the steps that make them. Pruned to what outputs read;
 //! stages that share a pass are one step.
 
+use std::sync::Arc;
+
 use crate::config::WhereRule;
 use crate::grid::{Affine, Border, DType};
-use crate::kernel::obscurance::ObscuranceParams;
+use crate::kernel::obscurance::{ObscuranceParams, Prepared};
 use crate::stage::{
     Bound, CombineKind, GradientWeight, Ties, TransferPoint, WindowChannel, WindowMode, WindowParams, WindowShape,
 };
@@ -153,6 +155,8 @@ pub enum StepKind {
     /// Inputs: density, then colour and normal where present.
     Obscurance {
         params: ObscuranceParams,
+        /// Made of the parameters for this volume: planning asks it again and again.
+        sweep: Arc<Prepared>,
         channels: Vec<ObscuranceChannel>,
         colour: Option<WireId>,
         normal: Option<WireId>,

@@ -95,8 +95,7 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
         StepKind::Moments4 { params, .. } => moments4::scratch_bytes(dtype, src, dst, params),
         StepKind::Gaussian { sigma, channels } => gaussian::scratch_bytes(dtype, src, dst, *sigma, channels.len() > 1),
         StepKind::Gradient { size, .. } => gradient::scratch_bytes(dtype, src, dst, *size),
-        StepKind::Obscurance { params, colour, normal, .. } => {
-            let sweep = obscurance::Prepared::new(params);
+        StepKind::Obscurance { sweep, colour, normal, .. } => {
             let wide = dtype.result() == DType::F64;
             if let Some(read) = step.streamed {
                 let kernel = sweep.streamed_bytes(dtype, volume, dst, normal.is_some());
@@ -117,7 +116,7 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
 /// The mask of a step, and what a kernel that skips keeps of it.
 fn masked(step: &Step, dst: Shape) -> usize {
     let kernel = match &step.kind {
-        StepKind::Obscurance { params, .. } => obscurance::Prepared::new(params).masked_bytes(dst),
+        StepKind::Obscurance { sweep, .. } => sweep.masked_bytes(dst),
         _ => 0,
     };
     if step.mask.is_some() { dst.iter().product::<usize>() + kernel } else { 0 }

@@ -41,14 +41,15 @@ pub struct Prepass {
     pub kind: PrepassKind,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PrepassKind {
     /// The largest value (`saliency` with `scale = "max"`).
     Max,
     /// Least and largest value (`range = "auto"`).
     MinMax,
-    /// Quantile levels (`method = "levels"`, and the codes of `"moments4"`); `flipped` where smaller stored values are denser.
-    Levels { count: usize, flipped: bool },
+    /// Quantile levels (`method = "levels"`, and the codes of `"moments4"`); `flipped` where smaller stored values are denser,
+    /// `beyond` the stored value that a constant border adds to windows.
+    Levels { count: usize, flipped: bool, beyond: Option<f64> },
 }
 
 /// Finds a GPU, or says what was looked for.

@@ -259,6 +259,9 @@ fn choose_reduce(output: &Output, used: &[&Wire], key: &str) -> Result<Reduce> {
         None => Ok(Reduce::Mean),
         Some(Reduce::Min) if !all(&["min"]) => Err(Error::config(key, "\"min\" is for channels named min")),
         Some(Reduce::Max) if !all(&["max"]) => Err(Error::config(key, "\"max\" is for channels named max")),
+        Some(Reduce::Moments) if all(&["variance", "std"]) && !all(&["variance"]) && !all(&["std"]) => Err(
+            Error::config(key, "\"moments\" is for variances or for standard deviations, not for both in one array"),
+        ),
         Some(Reduce::Moments) if !all(&["variance"]) && !all(&["std"]) => {
             Err(Error::config(key, "\"moments\" is for the channels variance and std"))
         }

@@ -7,7 +7,6 @@ use super::{Group, Plan, brick, tasks};
 use crate::Result;
 use crate::config::Config;
 use crate::grid::{Region, Shape};
-use crate::kernel::obscurance::Prepared;
 
 /// Cuts the groups and chooses their bricks, with sweeps streamed where that is less work.
 pub fn choose(plan: &mut Plan, config: &Config) -> Result<()> {
@@ -114,9 +113,9 @@ pub fn work(plan: &Plan, group: &Group, amplification: f64) -> f64 {
 /// Voxels that a streamed step fetches for a brick in the middle of the volume.
 pub fn fetched(plan: &Plan, step: StepId, brick: Shape, volume: Shape) -> usize {
     let step = &plan.graph.steps[step];
-    let StepKind::Obscurance { params, normal, .. } = &step.kind else { return 0 };
+    let StepKind::Obscurance { sweep, normal, .. } = &step.kind else { return 0 };
     let lo: [i64; 3] = std::array::from_fn(|a| (volume[a].saturating_sub(brick[a]) / 2) as i64);
     let whole = Region::whole(volume);
     let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + brick[a] as i64)).grow(step.halo).clip(&whole);
-    Prepared::new(params).streamed_voxels(brick, whole, normal.is_some())
+    sweep.streamed_voxels(brick, whole, normal.is_some())
 }

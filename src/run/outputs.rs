@@ -53,10 +53,19 @@ pub fn claim_begun(config: &Config, plan: &Plan) -> Result<Vec<Option<Claim>>> {
 pub fn claim_all(config: &Config, plan: &Plan, claims: &mut [Option<Claim>]) -> Result<()> {
     for (output, claim) in plan.outputs.iter().zip(claims) {
         if !claim.as_ref().is_some_and(Claim::holds) {
-            *claim = Some(Claim::make(&output.spec.path)?.map_err(|_| busy(config, output))?);
+            let made = Claim::make(&output.spec.path).map_err(|e| of_path(config, output, e))?;
+            *claim = Some(made.map_err(|_| busy(config, output))?);
         }
     }
     Ok(())
+}
+
+/// A file error told with the key that led to it: the path may be one that only the config can mend.
+fn of_path(config: &Config, output: &OutputPlan, error: Error) -> Error {
+    let Error::File { path, message } = error else { return error };
+    let place = &config_output(config, output).place;
+    let line = place.line_of("path").map(|n| format!(":{n}")).unwrap_or_default();
+    Error::file(path, format!("{message}; see {}.path in {}{line}", place.key, config.file.display()))
 }
 
 fn busy(config: &Config, output: &OutputPlan) -> Error {

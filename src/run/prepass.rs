@@ -35,8 +35,8 @@ impl Finder {
     /// The numbers that steps and outputs read.
     pub fn result(self, kind: PrepassKind) -> Vec<f64> {
         match (self, kind) {
-            (Finder::Levels(sketch), PrepassKind::Levels { count, flipped }) => {
-                sketch.levels(count, flipped).to_numbers()
+            (Finder::Levels(sketch), PrepassKind::Levels { count, flipped, beyond }) => {
+                sketch.levels(count, flipped, beyond).to_numbers()
             }
             (Finder::MinMax(found), kind) => found.result(kind).to_vec(),
             (Finder::Levels(_), _) => Vec::new(),

@@ -127,16 +127,21 @@ impl Sketch {
         }
     }
 
-    /// The levels; `flipped` where smaller stored values are denser.
-    pub fn levels(self, count: usize, flipped: bool) -> Levels {
+    /// The levels; `flipped` where smaller stored values are denser. `beyond`, the value of a constant border, is one of them:
+    /// it may fill most of a window and yet occur nowhere in the volume.
+    pub fn levels(self, count: usize, flipped: bool, beyond: Option<f64>) -> Levels {
         let turn = |v: f64| if flipped { 0.0 - v } else { v };
+        // As windows see it.
+        let beyond = beyond.map(|v| if self.dtype.result() == DType::F32 { f64::from(v as f32) } else { v } + 0.0);
         let (mut values, sampled) = match self.found.into_inner().unwrap_or_else(|e| e.into_inner()) {
             Found::Counts(counts) => {
                 let first = self.dtype.range().0;
                 let seen = counts.iter().enumerate().filter(|(_, n)| **n > 0);
                 (seen.map(|(i, n)| (turn(first + i as f64), *n)).collect::<Vec<_>>(), false)
             }
-            Found::Sample { few: Some(few), .. } if few.len() <= count => {
+            Found::Sample { few: Some(few), .. }
+                if few.len() + usize::from(beyond.is_some_and(|v| !few.contains(&v))) <= count =>
+            {
                 (few.iter().map(|v| (turn(*v), 1)).collect(), false)
             }
             Found::Sample { least, most, mut sample, .. } => {
@@ -144,6 +149,9 @@ impl Sketch {
                 (weigh(sample.into_iter().map(turn).collect()), true)
             }
         };
+        if let Some(v) = beyond.map(turn) {
+            give_weight(&mut values, v, count);
+        }
         values.sort_by(|a, b| a.0.total_cmp(&b.0));
         if !sampled {
             return Levels::choose(&values, count);
@@ -216,6 +224,16 @@ fn merge(all: &mut Found, part: Found) {
     }
 }
 
+/// Makes a value one of those that more than their share of all have, which are levels.
+fn give_weight(values: &mut Vec<(f64, u64)>, v: f64, count: usize) {
+    let total: u64 = values.iter().map(|v| v.1).sum();
+    let more = total / (count as u64 - 1) + 1;
+    match values.iter_mut().find(|w| w.0 == v) {
+        Some(known) => known.1 += more,
+        None => values.push((v, more)),
+    }
+}
+
 /// Distinct values with their numbers.
 fn weigh(mut all: Vec<f64>) -> Vec<(f64, u64)> {
     all.retain(|v| v.is_finite());
@@ -250,7 +268,7 @@ mod tests {
             sketch.voxels(View::dense(&part, brick.shape()), None, brick, &mut found);
             merge(&mut sketch.found.lock().unwrap(), found);
         }
-        sketch.levels(count, flipped)
+        sketch.levels(count, flipped, None)
     }
 
     #[test]
@@ -274,6 +292,40 @@ mod tests {
             assert!(inner.iter().all(|t| (0.0..=256.0).contains(t)), "{inner:?}");
             let widest = inner.windows(2).map(|w| (w[1] - w[0]).abs()).fold(0.0, f64::max);
             assert!(widest < 2.0 * 256.0 / 31.0, "{widest}");
+        }
+    }
+
+    #[test]
+    fn the_value_of_a_border_is_a_level() {
+        let region = Region::whole([1, 1, 4096]);
+        let noise: Vec<f32> = (0..4096).map(|i| (hash(i, 3) % 1000) as f32).collect();
+        let found = |v: &[f32], dtype, count, flipped, beyond| {
+            let sketch = Sketch::new(dtype, region.shape());
+            let mut part = nothing(dtype);
+            let codes: Vec<u16> = v.iter().map(|v| *v as u16).collect();
+            match dtype {
+                DType::F32 => sketch.voxels(View::dense(v, region.shape()), None, region, &mut part),
+                _ => sketch.voxels(View::dense(&codes, region.shape()), None, region, &mut part),
+            }
+            merge(&mut sketch.found.lock().unwrap(), part);
+            sketch.levels(count, flipped, Some(beyond))
+        };
+        for (dtype, flipped) in [(DType::F32, false), (DType::F32, true), (DType::U16, false), (DType::U16, true)] {
+            for beyond in [-77.0, 500.0, 333.25, 5000.0] {
+                let levels = found(&noise, dtype, 16, flipped, beyond);
+                let turned = if flipped { -beyond } else { beyond };
+                let at = levels.at.iter().position(|v| *v == turned).expect("the border's value is a level");
+                assert!(levels.step[at] && levels.at.len() == 16, "{dtype:?} {beyond}: {levels:?}");
+            }
+        }
+        // With eight values there is room for one more, with nine there is not, and it is a level all the same.
+        for kinds in [8, 9] {
+            let few: Vec<f32> = (0..4096).map(|i| (i % kinds) as f32).collect();
+            for dtype in [DType::F32, DType::U16] {
+                let levels = found(&few, dtype, 9, false, 100.5);
+                assert!(levels.at.contains(&100.5) && levels.at.len() == 9, "{levels:?}");
+                assert!(kinds == 9 || levels.step.iter().all(|s| *s));
+            }
         }
     }
 

@@ -1,6 +1,7 @@
 //! Runs one step of the graph on one brick: cuts what the kernel may see, applies the border rule and the mask.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use super::lanes::gradient_out;
 use super::metrics::Metrics;
@@ -26,7 +27,7 @@ use crate::stage::WindowParams;
 pub struct Engine<'a> {
     pub plan: &'a Plan,
     pub level: Level,
-    pub sweeps: HashMap<StepId, Prepared>,
+    pub sweeps: HashMap<StepId, Arc<Prepared>>,
     /// Results of the pre-passes so far.
     pub globals: Vec<Vec<f64>>,
     /// Constants are propagated instead of computed.
@@ -52,7 +53,7 @@ impl<'a> Engine<'a> {
     pub fn new(plan: &'a Plan, pool: &'a Pool, gpu: Option<&'a Gpu>, metrics: &'a Metrics, skip: bool) -> Engine<'a> {
         let sweeps = (plan.graph.steps.iter().enumerate())
             .filter_map(|(i, s)| match &s.kind {
-                StepKind::Obscurance { params, .. } => Some((i, Prepared::new(params))),
+                StepKind::Obscurance { sweep, .. } => Some((i, sweep.clone())),
                 _ => None,
             })
             .collect();

@@ -20,7 +20,22 @@ pub fn of_output(output: &OutputPlan) -> Vec<[f64; 2]> {
     let components = output.spec.components.unwrap_or(1);
     let fallback = if output.spec.dtype.is_float() { [0.0, 1.0] } else { output.spec.dtype.range().into() };
     let source = if output.is_zarr() { Source::open(&coarsest(output)).ok() } else { None };
-    (0..components).map(|c| source.as_ref().and_then(|s| window(s, c)).unwrap_or(fallback)).collect()
+    let mut windows: Vec<[f64; 2]> =
+        (0..components).map(|c| source.as_ref().and_then(|s| window(s, c)).unwrap_or(fallback)).collect();
+    share_of_colours(&output.spec.component_names, fallback, &mut windows);
+    windows
+}
+
+/// The three parts of a colour share one window, which holds `whole`: stretched each for itself they are other colours.
+fn share_of_colours(names: &[String], whole: [f64; 2], windows: &mut [[f64; 2]]) {
+    let is = |name: &String, part: &str| name.rsplit(' ').next() == Some(part);
+    for i in 0..names.len().min(windows.len()).saturating_sub(2) {
+        if ["red", "green", "blue"].iter().zip(&names[i..]).all(|(part, name)| is(name, part)) {
+            let of = &mut windows[i..i + 3];
+            let shared = of.iter().fold(whole, |s, w| [s[0].min(w[0]), s[1].max(w[1])]);
+            of.fill(shared);
+        }
+    }
 }
 
 fn coarsest(output: &OutputPlan) -> Input {
@@ -67,5 +82,22 @@ fn window(source: &Source, component: usize) -> Option<[f64; 2]> {
     let last = values.len().checked_sub(1)?;
     let mut at = |share: f64| *values.select_nth_unstable_by((share * last as f64).round() as usize, f64::total_cmp).1;
     let (lo, hi) = (at(TAIL), at(1.0 - TAIL));
-    Some(if hi > lo { [lo, hi] } else { [lo, lo + 1.0] })
+    // Far from 0 one more is no more.
+    Some(if hi > lo { [lo, hi] } else { [lo, lo + lo.abs().max(1e6) * 1e-6] })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_are_not_stretched_apart() {
+        let names = ["ao.openness", "t.rgb red", "t.rgb green", "t.rgb blue", "red", "green"].map(String::from);
+        let own = [[0.4, 0.5], [0.1, 0.2], [-0.5, 0.3], [0.0, 2.0], [0.1, 0.2], [0.3, 0.4]];
+        let mut windows = own;
+        share_of_colours(&names, [0.0, 1.0], &mut windows);
+        assert_eq!(windows, [own[0], [-0.5, 2.0], [-0.5, 2.0], [-0.5, 2.0], own[4], own[5]]);
+        share_of_colours(&[], [0.0, 1.0], &mut windows[..1]);
+        assert_eq!(windows[0], own[0]);
+    }
 }

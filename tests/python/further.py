@@ -7,62 +7,10 @@ import math
 from fractions import Fraction
 
 import numpy as np
-from scipy.spatial import ConvexHull, SphericalVoronoi
+from formulas import first_occluder, icosahedron, regression
+from scipy.spatial import SphericalVoronoi
 
 RNG = np.random.default_rng(20261126)
-
-
-def icosahedron(n):
-    g = (1 + math.sqrt(5)) / 2
-    points = np.array([np.roll((0, a, b * g), k) for a in (1, -1) for b in (1, -1) for k in range(3)])
-    points /= np.linalg.norm(points[0])
-    while len(points) < n:
-        edges = {tuple(sorted(e)) for t in ConvexHull(points).simplices for e in itertools.combinations(t, 2)}
-        middles = np.array([points[a] + points[b] for a, b in sorted(edges)])
-        points = np.vstack([points, middles / np.linalg.norm(middles, axis=1)[:, None]])
-    return points
-
-
-def regression(v, spacing, size, inverse):
-    """The gradient by weighted linear regression, with the full normal equations where a voxel is missing."""
-    h = size // 2
-    pad = np.pad(v, h, mode="edge")
-    offsets = np.array(list(itertools.product(range(-h, h + 1), repeat=3)))
-    x = offsets * np.array(spacing, float)
-    distance = np.linalg.norm(x, axis=1)
-    weight = np.divide(1, distance, out=np.zeros_like(distance), where=distance > 0) if inverse else distance
-    out = np.full(v.shape + (3,), np.nan)
-    for p in np.ndindex(v.shape):
-        if np.isnan(v[p]):
-            continue
-        f = pad[tuple(slice(i, i + size) for i in p)].ravel()
-        have = ~np.isnan(f)
-        if have.all():
-            out[p] = ((weight * f) @ x) / (weight @ x**2)
-            continue
-        a = np.c_[x, np.ones(len(x))][have] * np.sqrt(weight[have])[:, None]
-        out[p] = np.linalg.lstsq(a, f[have] * np.sqrt(weight[have]), rcond=None)[0][:3]
-    return out
-
-
-def first_occluder(v, w, spacing, reach):
-    """Planes to the first larger voxel along the lattice lines of direction w (x, y, z); 0 where there is none."""
-    u = w[::-1] / spacing
-    a = max(range(3), key=lambda i: (round(abs(u[i]), 12), -i))
-    sign, m = (1 if u[a] > 0 else -1), u / abs(u[a])
-    step = float(np.linalg.norm(spacing * m))
-    at = lambda k, b: math.floor(k * m[b] + 0.5)
-    planes = np.zeros(v.shape, int)
-    for p in np.ndindex(v.shape):
-        k = sign * p[a]
-        for j in range(1, math.floor(reach / step + 1e-9) + 1):
-            q = tuple(p[b] + (sign * j if b == a else at(k + j, b) - at(k, b)) for b in range(3))
-            if not all(0 <= q[b] < v.shape[b] for b in range(3)):
-                break
-            if v[q] > v[p]:
-                planes[p] = j
-                break
-    return planes, step
 
 
 def weights(folder, stage, close):
@@ -77,10 +25,10 @@ def weights(folder, stage, close):
         normal = -regression(d, spacing, 3, True)
         length = np.linalg.norm(normal, axis=-1)
         area = SphericalVoronoi(points, 1, np.zeros(3)).calculate_areas()
-        reach = 4.0 * spacing.min()
+        reach = 4.0
         value = []
         for w in points:
-            planes, step = first_occluder(d, w, spacing, reach)
+            planes, _, step = first_occluder(np.nan_to_num(d), ~np.isnan(d), w, spacing, reach)
             value.append(np.where(planes > 0, np.sqrt(planes * step / reach), 1.0))
         for facing in (False, True):
             for cells in (False, True):

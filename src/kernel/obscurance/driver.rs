@@ -253,8 +253,14 @@ fn sheet<K: Key, H: Hit, S: Sink>(
 ) -> u64 {
     let [shift_b, shift_c] = visit.shifts;
     let Range { start, end } = strip.planes;
-    let first = start.saturating_sub(visit.reach);
-    let starts = &mut room.starts[..(end + visit.reach).min(shift_b.len()) - first];
+    // Lines that leave the source see nothing more: in a volume of few planes they leave it long before their reach.
+    let Region { lo, hi } = volume.region;
+    let (b, last) = (1 - strip.axis, LANES as i64 - 1);
+    let near = start.saturating_sub(visit.reach)..(end + visit.reach).min(shift_b.len());
+    let near = planes_inside(shift_b, near, strip.start[0], lo[b], hi[b]);
+    let near = planes_inside(shift_c, near, strip.start[1], lo[2] - last, hi[2]);
+    let first = near.start;
+    let starts = &mut room.starts[..near.len()];
     place(volume, strip.axis, shift_b, shift_c, strip.start, first, starts);
     let sheet = Sheet { data: volume.data(), planes: starts };
     let count = strip.planes.len() * LANES;

@@ -1,6 +1,7 @@
 //! Lattice lines: how a direction cuts the volume into parallel lines of voxels (SPEC section 4, obscurance).
 
 use super::ObscuranceParams;
+use crate::grid::Shape;
 use crate::stage::{DirectionSet, Rho, directions};
 
 /// No axis of a volume is longer; keeps tables bounded whatever `max_distance` says.
@@ -55,15 +56,16 @@ fn fraction_bits(directions: usize) -> u32 {
     (1..=22).rev().find(|&b| directions as u64 * ((1u64 << b) + 2) < 1 << 32).unwrap_or(1)
 }
 
-/// The families of all directions, and the sum of all contributions where nothing occludes.
-pub(super) fn families(p: &ObscuranceParams) -> (Vec<Family>, u64) {
+/// The families of all directions, and the sum of all contributions where nothing occludes. No voxel of `volume` sees further
+/// than its planes.
+pub(super) fn families(p: &ObscuranceParams, volume: Shape) -> (Vec<Family>, u64) {
     let set = directions::directions(p.set, p.directions.max(1));
     let weights = directions::weights(p.weights, &set);
     let scale = (1u64 << fraction_bits(set.len())) as f64;
     let mut out: Vec<Family> = Vec::new();
     let mut total = 0;
     for (w, weight) in set.into_iter().zip(weights) {
-        let (mut family, way) = family_of(w, p);
+        let (mut family, way) = family_of(w, p, volume);
         let table: Vec<u32> = family.rho.iter().map(|r| (r * weight * scale).round_ties_even() as u32).collect();
         total += table[family.reach] as u64;
         let sense = Sense { direction: w, weight, table };
@@ -81,7 +83,7 @@ pub(super) fn families(p: &ObscuranceParams) -> (Vec<Family>, u64) {
 }
 
 /// The lines of one direction, and which way along them it goes.
-fn family_of(w: [f64; 3], p: &ObscuranceParams) -> (Family, usize) {
+fn family_of(w: [f64; 3], p: &ObscuranceParams, volume: Shape) -> (Family, usize) {
     let u: [f64; 3] = std::array::from_fn(|b| w[b] / p.spacing[b]);
     let rounded = u.map(|c| (c.abs() * 1e12).round());
     let axis = (1..3).fold(0, |best, b| if rounded[b] > rounded[best] { b } else { best });
@@ -90,6 +92,7 @@ fn family_of(w: [f64; 3], p: &ObscuranceParams) -> (Family, usize) {
     squares.sort_by(f64::total_cmp);
     let step = (squares[0] + squares[1] + squares[2]).sqrt() / finest;
     let reach = ((p.max_distance / step + 1e-9).floor().max(0.0) as usize).min(MAX_REACH);
+    let reach = reach.min(volume[axis].saturating_sub(1));
     let mut rho_of: Vec<f64> = (1..=reach).map(|j| rho(p.rho, j as f64 * step, p.max_distance)).collect();
     rho_of.push(1.0);
     let slope = std::array::from_fn(|b| if b == axis { 1.0 } else { u[b] / u[axis] + 0.0 });

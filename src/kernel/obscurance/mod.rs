@@ -107,12 +107,24 @@ pub struct ObscuranceIo<'a> {
     pub rgb: Option<[AnyViewMut<'a>; 3]>,
 }
 
+/// It is made of the parameters alone.
+impl PartialEq for Prepared {
+    fn eq(&self, other: &Prepared) -> bool {
+        self.params == other.params
+    }
+}
+
 impl Prepared {
-    /// Panics on a spacing or distance that is not positive.
+    /// For volumes of any extent. Panics on a spacing or distance that is not positive.
     pub fn new(params: &ObscuranceParams) -> Prepared {
+        Prepared::within(params, [usize::MAX; 3])
+    }
+
+    /// For a volume of this shape: tables end where it does, whatever `max_distance` says. Panics as [`Prepared::new`].
+    pub fn within(params: &ObscuranceParams, volume: Shape) -> Prepared {
         assert!(params.spacing.iter().all(|s| *s > 0.0 && s.is_finite()), "spacing {:?}", params.spacing);
         assert!(params.max_distance >= 0.0, "max_distance {}", params.max_distance);
-        let (mut families, total) = lines::families(params);
+        let (mut families, total) = lines::families(params, volume);
         driver::sort(&mut families);
         let uniform = weighted::uniform(&families);
         Prepared { params: params.clone(), families, total, uniform }

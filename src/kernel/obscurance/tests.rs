@@ -191,7 +191,7 @@ fn every_search_finds_the_next_greater_key() {
 
 /// What the fixed-point sum of the reference's hits must give, bit for bit.
 fn expected<T: Voxel>(p: &ObscuranceParams, field: &Field<T>, out: Region) -> Vec<f32> {
-    let (families, total) = lines::families(p);
+    let (families, total) = lines::families(p, [usize::MAX; 3]);
     let one = |at: [i64; 3]| {
         if missing(field.data[field.index(at).unwrap()], p) {
             return f32::NAN;
@@ -447,7 +447,7 @@ fn sums_of_thousands_of_directions_fit() {
     let data = vec![1u8; 27];
     for directions in [1, 2, 4095, 4096, 9000] {
         let p = ObscuranceParams { directions, set: DirectionSet::Fibonacci, ..params() };
-        let (families, total) = lines::families(&p);
+        let (families, total) = lines::families(&p, [usize::MAX; 3]);
         assert!(total < 1 << 32);
         assert_eq!(families.iter().flat_map(|f| f.senses.iter().flatten()).count(), directions);
         assert_eq!(directions::directions(p.set, directions).len(), directions);

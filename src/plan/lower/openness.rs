@@ -3,6 +3,7 @@
 use super::{Lowering, lengths};
 use crate::Result;
 use crate::config::{AoRegion, Op, StageNode};
+use crate::grid::Border;
 use crate::kernel::levels::MOST_LEVELS;
 use crate::kernel::moments4;
 use crate::plan::PrepassKind;
@@ -30,12 +31,14 @@ impl Lowering<'_> {
                 StepKind::Rank { params, shape, ties }
             }
             Method::Levels => {
-                let kind = PrepassKind::Levels { count: *level_count, flipped: params.flipped() };
+                let wire = &self.out.graph.wires[src];
+                let beyond = matches!(node.border, Border::Constant(_)).then(|| wire.beyond(node.border).0);
+                let kind = PrepassKind::Levels { count: *level_count, flipped: params.flipped(), beyond };
                 StepKind::Levels { params, levels: self.prepass(src, kind), ties }
             }
             Method::Moments4 => {
                 let wide = moments4::needs_codes(window_dtype(self.out.graph.wires[src].dtype, node.border));
-                let kind = PrepassKind::Levels { count: MOST_LEVELS, flipped: false };
+                let kind = PrepassKind::Levels { count: MOST_LEVELS, flipped: false, beyond: None };
                 let codes = wide.then(|| self.prepass(src, kind));
                 let channels = wanted.iter().map(|c| bound(c)).collect();
                 StepKind::Moments4 { params, codes, ties, channels }

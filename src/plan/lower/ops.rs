@@ -1,5 +1,7 @@
 //! Stages that make more than one step, or share one.
 
+use std::sync::Arc;
+
 use super::super::graph::*;
 use super::super::{Prepass, PrepassKind, lengths};
 use super::{Lowering, Target, UNROUNDED_MEAN};
@@ -157,13 +159,14 @@ impl Lowering<'_> {
             ambient: op.ambient,
             ranks,
         };
-        let reach = obscurance::Prepared::new(&params).reach();
+        let sweep = Arc::new(obscurance::Prepared::within(&params, self.lattice(src).shape));
+        let reach = sweep.reach();
         let channels = wanted
             .iter()
             .map(|c| if *c == "openness" { ObscuranceChannel::Openness } else { ObscuranceChannel::Rgb })
             .collect();
         let inputs = [Some(src), colour, normal].into_iter().flatten().collect();
-        let kind = StepKind::Obscurance { params, channels, colour, normal };
+        let kind = StepKind::Obscurance { params, sweep, channels, colour, normal };
         self.push_step(index, node, kind, inputs, reach, Border::Clip, wanted)
     }
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use super::{Sink, flat};
+use super::{Sink, files, flat};
 use crate::{Error, Result};
 
 /// Marker in the work folder.
@@ -153,8 +153,23 @@ pub fn remove_ours(path: &Path) -> Result<()> {
     remove_work_dir(&Sink::work_dir(path))
 }
 
-/// Arrays first, the group's metadata last: killed halfway, the rest is still known as ours.
+/// Takes back that a group is complete, before anything of it goes; where that cannot be written, nothing can be removed.
+fn mark_unfinished(path: &Path) -> Result<()> {
+    for (name, at) in [("zarr.json", "/attributes/occlude"), (".zattrs", "/occlude")] {
+        let file = path.join(name);
+        let Some(mut group) = read_json(&file) else { continue };
+        let Some(occlude) = group.pointer_mut(at).and_then(Value::as_object_mut) else { continue };
+        if occlude.remove("complete").is_some() {
+            let temps = files::Temps::open(&Sink::work_dir(path))?;
+            temps.write(&[(file, group.to_string().into_bytes())])?;
+        }
+    }
+    Ok(())
+}
+
+/// Arrays first, the group's metadata last: killed halfway, the rest is still known as ours, and as unfinished.
 fn remove_group(path: &Path) -> Result<()> {
+    mark_unfinished(path)?;
     let attributes = group_attributes(path).unwrap_or_default();
     let image = if attributes["ome"].is_object() { &attributes["ome"] } else { &attributes };
     let datasets = image["multiscales"][0]["datasets"].as_array().cloned().unwrap_or_default();

@@ -19,6 +19,12 @@ pub fn cannot_write(path: &Path, error: io::Error) -> Error {
                 "cannot be written: no room left on the device ({error}); what was finished is kept, make room and --resume"
             ),
         ),
+        io::ErrorKind::FileTooLarge => Error::file(
+            path,
+            format!(
+                "cannot be written: larger than a file may be here ({error}; see ulimit -f); what was finished is kept, --resume continues"
+            ),
+        ),
         _ => Error::file(path, format!("cannot be written: {error}")),
     }
 }

@@ -294,9 +294,9 @@ fn open_path(input: &Input, path: &Path, raw: Option<&crate::config::RawFormat>)
         (_, Some(Format::Nrrd)) => nrrd::open(input, path)?,
         (_, Some(Format::MetaImage)) => metaimage::open(input, path)?,
         (_, Some(Format::Tiff)) => tiff::open(input, path)?,
-        _ => raw::open_npy(path)?,
+        _ => raw::open_npy(input, path)?,
     };
-    if raw.is_some() || format == Some(Format::Npy) {
+    if raw.is_some() {
         components(input, 1, 1, &[])?;
     }
     let (info, planar) = Planar::new(parsed)?;

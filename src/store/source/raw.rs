@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::bytes;
 use super::lattice::{Lattice, Planes};
-use super::planar::{Parsed, Pending, key, shape_of};
+use super::planar::{Parsed, Pending, components, key, shape_of};
 use super::spool::{Packed, Packing};
 use crate::config::{Input, RawFormat};
 use crate::grid::DType;
@@ -40,8 +40,9 @@ pub fn open_raw(input: &Input, path: &Path, raw: &RawFormat) -> Result<Parsed> {
 /// Longest `.npy` header that is read.
 const MOST_NPY_HEADER: usize = 1 << 16;
 
-/// NumPy's format, versions 1 to 3, C and Fortran order. Axes are `[z, y, x]`; leading axes beyond three must be 1.
-pub fn open_npy(path: &Path) -> Result<Parsed> {
+/// NumPy's format, versions 1 to 3, C and Fortran order. Axes are `[z, y, x]`, or `[c, z, y, x]` as outputs of several
+/// components have them; leading axes beyond four must be 1.
+pub fn open_npy(input: &Input, path: &Path) -> Result<Parsed> {
     let head = bytes::file_head(path, MOST_NPY_HEADER + 12)?;
     let broken = |text: &str| Error::file(path, format!("broken .npy header: {text}"));
     if head.len() < 12 || !head.starts_with(b"\x93NUMPY") {
@@ -73,25 +74,33 @@ pub fn open_npy(path: &Path) -> Result<Parsed> {
         .map(|d| d.trim_end_matches('L').parse())
         .collect::<Result<_, _>>()
         .map_err(|_| broken(&format!("shape ({dims}) is not a list of sizes")))?;
-    let lead = dims.len().saturating_sub(3);
+    let lead = dims.len().saturating_sub(4);
     if dims[..lead].iter().any(|n| *n != 1) {
-        return Err(Error::file(
-            path,
-            format!("shape {dims:?} has more than three axes longer than 1; save one volume"),
-        ));
+        let text = format!("shape {dims:?} has more than four axes longer than 1; expected (z, y, x) or (c, z, y, x)");
+        return Err(Error::file(path, text));
     }
-    let mut zyx = [1; 3];
+    let mut czyx = [1; 4];
     let last = &dims[lead..];
-    zyx[3 - last.len()..].copy_from_slice(last);
-    let shape = shape_of(path, zyx, dtype.size())?;
-    let base = (start + len) as u64;
-    let mut lattice = Lattice::dense(shape, dtype, big_endian, base).ok_or_else(|| broken("sizes overflow"))?;
-    if fortran {
-        let (size, [nz, ny, _]) = (dtype.size() as u64, zyx);
-        lattice.planes = Planes::Even { bases: vec![base], plane: size };
-        (lattice.row, lattice.step) = (size * nz, size * nz * ny);
+    czyx[4 - last.len()..].copy_from_slice(last);
+    let [channels, zyx @ ..] = czyx;
+    if channels == 0 {
+        return Err(Error::file(path, format!("axis c has size 0 (shape {dims:?})")));
     }
-    let info = VolumeInfo::plain(shape, dtype, if fortran { "npy, Fortran order" } else { "npy" });
+    let shape = shape_of(path, zyx, dtype.size())?;
+    let (base, size) = ((start + len) as u64, dtype.size() as u64);
+    let one = shape.iter().product::<usize>() as u64 * size;
+    channels.checked_mul(one).filter(|n| *n < 1 << 62).ok_or_else(|| broken("sizes overflow"))?;
+    let (pairs, names) = components(input, 1, channels as usize, &[])?;
+    let mut lattice = Lattice::dense(shape, dtype, big_endian, base).ok_or_else(|| broken("sizes overflow"))?;
+    // The first axis is the fastest in Fortran order, and channels stand before z.
+    let (between, z) = if fortran { (size, size * channels) } else { (one, one / zyx[0]) };
+    lattice.planes = Planes::Even { bases: pairs.iter().map(|(_, c)| base + *c as u64 * between).collect(), plane: z };
+    if fortran {
+        let [nz, ny, _] = zyx;
+        (lattice.row, lattice.step) = (z * nz, z * nz * ny);
+    }
+    let mut info = VolumeInfo::plain(shape, dtype, if fortran { "npy, Fortran order" } else { "npy" });
+    (info.components, info.component_names) = (pairs.len(), names);
     let header = head[..start + len].to_vec();
     Ok(Parsed { info, lattice, files: vec![path.to_path_buf()], pending: Pending::Nothing, header, exact: false })
 }

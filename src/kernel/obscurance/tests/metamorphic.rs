@@ -73,3 +73,32 @@ fn a_longer_reach_never_opens() {
         assert!(last.iter().any(|v| *v < 0.9));
     }
 }
+
+#[test]
+fn tables_that_end_with_the_volume_give_the_same_bits() {
+    for shape in [[1, 2, 300], [200, 1, 1], [1, 150, 1], [5, 40, 3], [17, 16, 18]] {
+        let region = Region::whole(shape);
+        let data = mixed(region, 60);
+        let sweep = |prepared: &Prepared| {
+            let mut openness = vec![-1f32; data.len()];
+            let mut scratch = Scratch::new();
+            let io = ObscuranceIo {
+                colour: None,
+                normal: None,
+                needed: None,
+                openness: Some(AnyViewMut::F32(ViewMut::dense(&mut openness, shape))),
+                rgb: None,
+            };
+            let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+            prepared.sweep(AnyView::U8(View::dense(&data, shape)), region, region, io, &mut cx);
+            bits(&openness)
+        };
+        for max_distance in [1.0, 4.0, 90.0, 1e4] {
+            let p = ObscuranceParams { max_distance, spacing: [2.0, 1.0, 1.5], ..params() };
+            assert!(sweep(&Prepared::within(&p, shape)) == sweep(&Prepared::new(&p)), "{shape:?} {max_distance}");
+        }
+        let endless = Prepared::within(&ObscuranceParams { max_distance: 1e300, ..params() }, shape);
+        let most = shape.into_iter().max().unwrap();
+        assert!(endless.reach().into_iter().all(|r| r <= most), "{:?}", endless.reach());
+    }
+}
