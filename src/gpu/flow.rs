@@ -3,6 +3,8 @@
 //!
 //! All boxes are in voxels of the volume. A part's boxes go from the sinks backward: each step makes what its readers see.
 
+use std::sync::Arc;
+
 use super::extend::Beyond;
 use super::flow_steps::Made;
 use super::levels::{Placed, Pyramid, Slab};
@@ -16,7 +18,7 @@ use super::sweep::repeated;
 use super::taps::Wanted;
 use super::unfit::{Unfit, cut_to};
 use crate::grid::{Affine, DType, Region};
-use crate::kernel::obscurance::ObscuranceParams;
+use crate::kernel::obscurance::Prepared;
 use crate::stage::{WindowChannel, WindowParams};
 
 /// What a step computes.
@@ -32,7 +34,7 @@ pub enum Kernel {
         vector: bool,
     },
     /// Openness by obscurance.
-    Sweep(ObscuranceParams),
+    Sweep(Arc<Prepared>),
     Windows {
         params: WindowParams,
         channels: Vec<WindowChannel>,

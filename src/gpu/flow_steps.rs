@@ -12,7 +12,7 @@ use super::sweep::{Keys, SweepJob, SweepPart};
 use super::taps::{TapsJob, Wanted};
 use super::unfit::Unfit;
 use crate::grid::{Affine, DType, Region};
-use crate::kernel::obscurance::{ObscuranceParams, Prepared};
+use crate::kernel::obscurance::Prepared;
 use crate::kernel::window::Needs;
 use crate::stage::{WindowChannel, WindowParams};
 
@@ -91,7 +91,7 @@ impl FlowStep {
                 window.gradient(fit, [*magnitude, *vector], flag, to).ok_or(Unfit::Kernel)
             }
             Kernel::Windows { params, channels } => window.windows(params, channels, flag, to).ok_or(Unfit::Kernel),
-            Kernel::Sweep(params) => window.sweep(params, cap, to),
+            Kernel::Sweep(prepared) => window.sweep(prepared, cap, to),
             Kernel::Points(ops) => {
                 let planes = Planes::take(to, region.voxels(), ops.len());
                 for (c, (op, of)) in ops.iter().enumerate() {
@@ -168,13 +168,13 @@ impl Window {
         Some(Made::planes(&planes, count, &self.region))
     }
 
-    fn sweep(&self, params: &ObscuranceParams, cap: u64, to: &mut Recorder) -> Result<Made, Unfit> {
-        let (prepared, from) = (Prepared::new(params), self.read.slab);
-        let job = SweepJob::new(&prepared, self.dtype, from.region, self.region).ok_or(Unfit::Kernel)?;
+    fn sweep(&self, prepared: &Prepared, cap: u64, to: &mut Recorder) -> Result<Made, Unfit> {
+        let from = self.read.slab;
+        let job = SweepJob::new(prepared, self.dtype, from.region, self.region).ok_or(Unfit::Kernel)?;
         let [nz, ny, _] = from.region.shape();
         let words = (nz * ny * from.pitch * self.read.stored.voxel).div_ceil(4);
         let codes = to.take(words as u64 * 4);
-        let keys = Keys::new(words, self.read.stored, params.flipped);
+        let keys = Keys::new(words, self.read.stored, prepared.flipped());
         to.dispatch(Shader::SweepCodes, 0, &keys, &[from.bind, codes.into()], keys.threads);
         let part = SweepPart { dst: self.region, src: from.region };
         let sums = job.sums(&part, codes.into(), cap, to)?;

@@ -335,7 +335,7 @@ fn kernel(graph: &Graph, step: &Step, globals: &[Vec<f64>]) -> Kernel {
             Kernel::Gradient { fit, magnitude, vector }
         }
         StepKind::Window { params, channels } => Kernel::Windows { params: *params, channels: channels.clone() },
-        StepKind::Obscurance { params, .. } => Kernel::Sweep(params.clone()),
+        StepKind::Obscurance { sweep, .. } => Kernel::Sweep(sweep.clone()),
         _ => Kernel::Points(ops(graph, step, globals)),
     }
 }

@@ -6,7 +6,7 @@ use super::{OutputPlan, Plan, flows};
 use crate::gpu::flow::Flow;
 use crate::gpu::{facts, passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
-use crate::kernel::{gaussian, gradient, levels, moments4, obscurance, rank, reduce, window};
+use crate::kernel::{gaussian, gradient, levels, moments4, rank, reduce, window};
 
 /// What the program itself, thread stacks and the allocator's slack take of the ceiling.
 pub const FIXED: u64 = 16 << 20;
@@ -220,12 +220,11 @@ fn slot_sizes(plan: &Plan, group: &Group, step: &Step, cap: u64) -> record::Size
 
 /// A sweep's job on a brick in the middle of its group; `None` where there is no kernel.
 pub fn with_sweep<R>(plan: &Plan, group: &Group, step: &Step, f: impl FnOnce(Option<sweep::SweepJob>) -> R) -> R {
-    let StepKind::Obscurance { params, .. } = &step.kind else { return f(None) };
+    let StepKind::Obscurance { sweep: prepared, .. } = &step.kind else { return f(None) };
     let (src, dst, at) = sees(group, step);
-    let prepared = obscurance::Prepared::new(params);
     let from = at.map(|n| n as i64);
     let inner = Region::new(from, std::array::from_fn(|a| from[a] + dst[a] as i64));
-    f(sweep::SweepJob::new(&prepared, plan.graph.wires[step.inputs[0]].dtype, Region::whole(src), inner))
+    f(sweep::SweepJob::new(prepared, plan.graph.wires[step.inputs[0]].dtype, Region::whole(src), inner))
 }
 
 /// Extents of what a step reads and makes of a brick in the middle, and where the one lies in the other.

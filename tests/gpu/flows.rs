@@ -1,5 +1,7 @@
 //! Steps that run together on the GPU equal the same steps one by one bit for bit, wherever a box lies and however it is cut.
 
+use std::sync::Arc;
+
 use occlude::brick::{Scratch, Voxels, gather};
 use occlude::gpu::Gpu;
 use occlude::gpu::extend::Beyond;
@@ -84,10 +86,10 @@ fn one_by_one(gpu: &Gpu, flow: &Flow, source: &Voxels) -> Vec<Vec<Voxels>> {
                 drop(outs);
                 out
             }
-            Kernel::Sweep(params) => {
+            Kernel::Sweep(prepared) => {
                 let (mut out, whole) = (room(1), flow.volume);
                 let AnyViewMut::F32(mut open) = out[0].view_mut(shape) else { unreachable!() };
-                gpu.obscurance(&Prepared::new(params), src.view(shape), whole, whole, &mut open, &mut cx).unwrap();
+                gpu.obscurance(prepared, src.view(shape), whole, whole, &mut open, &mut cx).unwrap();
                 out
             }
             Kernel::Points(ops) => {
@@ -156,7 +158,7 @@ fn recipes(affine: Affine) -> Vec<(&'static str, Vec<FlowStep>, bool)> {
             ranks: None,
             ambient: [1.0; 3],
         };
-        step(Kernel::Sweep(params), &[of])
+        step(Kernel::Sweep(Arc::new(Prepared::new(&params))), &[of])
     };
     let bordered = |step: FlowStep, border: Border, outside: u32| {
         let beyond = Beyond { border, outside };

@@ -8,7 +8,6 @@ use occlude::gpu::points::Op;
 use occlude::gpu::{Gpu, Needed, SinkOut};
 use occlude::grid::{Affine, AnyView, AnyViewMut, Border, DType, Region, Shape, View, ViewMut};
 use occlude::kernel::convert::{Mapping, convert};
-use occlude::kernel::obscurance::Prepared;
 use occlude::kernel::reduce::{Cells, Level0};
 use occlude::kernel::simd::Level;
 use occlude::kernel::{Context, pointwise};
@@ -50,7 +49,7 @@ pub fn step(kernel: Kernel, inputs: &[Input]) -> FlowStep {
         Kernel::Gaussian { sigma, .. } => sigma.map(|s| (3.0 * s).ceil() as usize),
         Kernel::Gradient { fit, .. } => [fit.size / 2; 3],
         Kernel::Windows { params, .. } => params.radius,
-        Kernel::Sweep(params) => Prepared::new(params).reach(),
+        Kernel::Sweep(prepared) => prepared.reach(),
         Kernel::Points(_) => [0; 3],
     };
     FlowStep { kernel, inputs: inputs.to_vec(), reach, beyond: CLIP, fills: None }

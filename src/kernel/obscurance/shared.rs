@@ -87,6 +87,11 @@ impl Prepared {
     pub fn total(&self) -> u32 {
         self.total as u32
     }
+
+    /// Whether smaller is denser.
+    pub fn flipped(&self) -> bool {
+        self.params.flipped
+    }
 }
 
 fn row<T: Coded, const BYTES: usize>(
