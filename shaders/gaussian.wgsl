@@ -2,7 +2,8 @@
 // after the centre c, or are c where they do not exist. One thread makes eight outputs along the axis, whose taps move on
 // by one voxel with each step, so that each voxel is read once.
 //
-// Agrees bit for bit with src/kernel/gaussian (mean_row in f32), since products are rounded by themselves (gaussian_mean.wgsl).
+// Agrees bit for bit with src/kernel/gaussian (mean_row in f32), since products are rounded by themselves: nothing else
+// could be fused into a sum (floats.wgsl).
 // Bindings, group 0: 0 uniform Taps; 1 storage, read: packed voxels (`first`) or bits of f32 (`next`); 2 storage, written:
 // bits of f32; 3 storage, read: bits of f32 weights, for each step away those of all outputs along the axis.
 // Workgroup: gaussian_taps.wgsl.
@@ -12,6 +13,10 @@ fn value(index: u32, packed: bool) -> f32 {
         return integer_at(index);
     }
     return bitcast<f32>(input[index]);
+}
+
+fn alone4(v: vec4<f32>) -> vec4<f32> {
+    return vec4<f32>(alone(v.x), alone(v.y), alone(v.z), alone(v.w));
 }
 
 // Of outputs k and on.

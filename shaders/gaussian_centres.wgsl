@@ -1,12 +1,11 @@
 // Where the taps of a thread's output lie. A shader adds `smooth_at`, which makes one output.
 
-// Where the centre of a thread's first output stands in the input, how many taps exist before and after it, where its weights
-// start, its place among the outputs along the axis, and its own.
+// Where the centre of a thread's first output stands in the input, how many taps exist before and after it, its place among the
+// outputs along the axis, and its own.
 struct Centre {
     here: u32,
     before: u32,
     after: u32,
-    weights: u32,
     k: u32,
     output: u32,
 }
@@ -31,7 +30,7 @@ fn centre_of(thread: u32) -> Centre {
     let centre = p.at + k;
     let here = i * p.in_i + j * p.in_j + (centre - p.start) * p.in_axis;
     let place = k * p.out_axis + i * p.out_i + j * p.out_j;
-    return Centre(here, centre, p.n - 1u - centre, p.weights + k, k, place);
+    return Centre(here, centre, p.n - 1u - centre, k, place);
 }
 
 fn one(thread: u32, first_pass: bool) {

@@ -34,3 +34,8 @@ struct Taps {
 @group(0) @binding(1) var<storage, read> input: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<u32>;
 @group(0) @binding(3) var<storage, read> weights: array<u32>;
+
+// The weight of a tap d steps away from output k; of one beyond the last that of the last.
+fn weight(k: u32, d: u32) -> f32 {
+    return bitcast<f32>(weights[p.weights + (d - 1u) * p.m + min(k, p.m - 1u)]);
+}

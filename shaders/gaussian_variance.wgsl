@@ -17,12 +17,12 @@ fn smooth_at(at: Centre, packed: bool) {
         if d <= at.after {
             both += distance(cell_at(at.here + d * p.in_axis, packed).mean, c.mean);
         }
-        moved += bitcast<f32>(weights[at.weights + (d - 1u) * p.m]) * both;
+        moved += weight(at.k, d) * both;
     }
     let mean = add(c.mean, alone(moved));
     var sum = vec2<f32>(spread(c, mean, bitcast<f32>(weights[p.centres + at.k])), 0.0);
     for (var d = 1u; d <= p.radius; d += 1u) {
-        let w = bitcast<f32>(weights[at.weights + (d - 1u) * p.m]);
+        let w = weight(at.k, d);
         if d <= at.before {
             sum = add(sum, alone(spread(cell_at(at.here - d * p.in_axis, packed), mean, w)));
         }

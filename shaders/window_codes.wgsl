@@ -16,7 +16,7 @@ struct Codes {
     in_y: u32,
     packing: u32,   // log2 of voxels per word
     flip: u32,      // the sign bit of a packed voxel, or 0: what codes are more than values
-    wide: u32,      // 1: sums of codes have two words; 2: those of squares
+    wide: u32,      // 1: sums of squares have two words
     at_z: u32,      // output 0 in the source, whose windows are cut there
     at_y: u32,
     at_x: u32,
@@ -46,7 +46,7 @@ struct Codes {
 }
 
 // What is compiled: 1 results in f64, 2 numerators of variances, 4 openness by powers, 8 by spreads, 16 counts
-// of voxels, 32 other channels than one mean that is not scaled, 64 sums of two words.
+// of voxels, 32 other channels than one mean that is not scaled, 64 sums of codes of two words.
 override parts: u32 = 127u;
 
 // Divisions that find a thread's place cost as much as a voxel.
@@ -362,13 +362,13 @@ fn window_at(z: u32, y: u32, x: u32, across: u32) -> Window {
     }
     if (p.needs & 1u) != 0u {
         w.s1 = vec2<u32>(sums[voxel], 0u);
-        if (parts & 64u) != 0u && (p.wide & 1u) != 0u {
+        if (parts & 64u) != 0u {
             w.s1 = vec2<u32>(sums[2u * voxel], sums[2u * voxel + 1u]);
         }
     }
     if (parts & 2u) != 0u && (p.needs & 2u) != 0u {
         w.s2 = vec2<u32>(squares[voxel], 0u);
-        if (p.wide & 2u) != 0u {
+        if p.wide == 1u {
             w.s2 = vec2<u32>(squares[2u * voxel], squares[2u * voxel + 1u]);
         }
     }

@@ -214,7 +214,7 @@ fn paths(config: &Config) -> Result<()> {
 }
 
 /// The folder beside an output in which sinks keep what is unfinished.
-fn work_folder(path: &Path) -> PathBuf {
+pub fn work_folder(path: &Path) -> PathBuf {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(".occlude");
     path.with_file_name(name)

@@ -151,7 +151,7 @@ impl Channels {
             row: strides[1] as u32,
             packing: if job.voxel == 1 { 2 } else { 1 },
             flip: job.flip(),
-            wide: wide(false) as u32 + 2 * wide(true) as u32,
+            wide: wide(true) as u32,
             at: std::array::from_fn(|a| (job.at[a] + part.lo[a]) as u32),
             radius: job.radius.map(|r| r as u32),
             size: job.src.map(|n| n as u32),

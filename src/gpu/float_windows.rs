@@ -2,13 +2,13 @@
 //! the CPU kernel.
 
 use super::engine::GpuError;
-use super::flow_call::paste;
+use super::flow_call::paste_floats;
 use super::pairs::Cell;
 use super::passes::{self, Job, Part, Quantity, result_bytes};
 use super::slopes::MARKED;
 use super::windows::cast;
 use crate::brick::Voxels;
-use crate::grid::{AnyView, AnyViewMut, DType, Region, View, ViewMut, Voxel};
+use crate::grid::{AnyView, AnyViewMut, Region, View, ViewMut, Voxel};
 use crate::kernel::Context;
 use crate::kernel::window::finish_floats::{Moments, finish_floats};
 use crate::kernel::window::{self, Place, WindowOut};
@@ -48,29 +48,10 @@ pub(super) fn store_all(results: &[u32], part: &Part, outs: &mut [WindowOut]) {
     let n: usize = part.dst.iter().product();
     // Planes come back from multiples of 256 bytes on.
     let plane = n.next_multiple_of(64);
-    outs.iter_mut().enumerate().for_each(|(c, out)| store(&results[c * plane..][..n], part, &mut out.dst));
-}
-
-fn store(results: &[u32], part: &Part, dst: &mut AnyViewMut) {
-    fn rows<T: Voxel>(d: &mut ViewMut<T>, results: &[f32], part: &Part, cast: impl Fn(f32) -> T) {
-        let ([nz, ny, nx], [z0, y0, x0]) = (part.dst, part.lo);
-        for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-            let row = d.row_at(z0 + z, y0 + y)[x0..x0 + nx].iter_mut();
-            row.zip(&results[(z * ny + y) * nx..]).for_each(|(d, r)| *d = cast(*r));
-        }
-    }
-    if dst.dtype() == DType::F32 {
-        return paste(bytemuck::cast_slice(results), part.dst, part.lo, dst);
-    }
     let results: &[f32] = bytemuck::cast_slice(results);
-    match dst {
-        // Extremes of small integers, which f32 holds.
-        AnyViewMut::U8(d) => rows(d, results, part, |r| r as u8),
-        AnyViewMut::I8(d) => rows(d, results, part, |r| r as i8),
-        AnyViewMut::U16(d) => rows(d, results, part, |r| r as u16),
-        AnyViewMut::I16(d) => rows(d, results, part, |r| r as i16),
-        other => unreachable!("the device makes no {}", other.dtype()),
-    }
+    outs.iter_mut().enumerate().for_each(|(c, out)| {
+        paste_floats(&results[c * plane..][..n], part.dst, part.lo, &mut out.dst);
+    });
 }
 
 /// The moments of a part.

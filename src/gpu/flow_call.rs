@@ -6,7 +6,7 @@ use super::levels::{EXCLUDED, Placed, Pyramid};
 use super::passes::Part;
 use super::stored::stored;
 use super::windows::{cast, pack};
-use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, Voxel};
+use crate::grid::{AnyView, AnyViewMut, Region, Shape, View, ViewMut, Voxel};
 
 /// Where a sink's results go.
 pub enum SinkOut<'a> {
@@ -141,18 +141,28 @@ pub(super) fn paste(bytes: &[u8], [nz, ny, nx]: Shape, at: [usize; 3], dst: &mut
 }
 
 /// As [`paste`], cast to the type of the channel, whose values it holds.
-fn paste_floats(floats: &[f32], [nz, ny, nx]: Shape, at: [usize; 3], dst: &mut AnyViewMut) {
-    fn row<T: Voxel>(to: &mut [T], from: &[f32]) {
-        to.iter_mut().zip(from).for_each(|(t, f)| *t = T::from_f64(*f as f64));
-    }
-    if dst.dtype() == DType::F32 {
-        return paste(bytemuck::cast_slice(floats), [nz, ny, nx], at, dst);
-    }
-    crate::with_view!(AnyViewMut, dst, d => {
+pub(super) fn paste_floats(floats: &[f32], shape: Shape, at: [usize; 3], dst: &mut AnyViewMut) {
+    fn rows<T: Voxel>(
+        floats: &[f32],
+        [nz, ny, nx]: Shape,
+        at: [usize; 3],
+        d: &mut ViewMut<T>,
+        cast: impl Fn(f32) -> T,
+    ) {
         for (z, y) in (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y))) {
-            row(&mut d.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx], &floats[(z * ny + y) * nx..]);
+            let to = d.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + nx].iter_mut();
+            to.zip(&floats[(z * ny + y) * nx..]).for_each(|(t, f)| *t = cast(*f));
         }
-    })
+    }
+    match dst {
+        AnyViewMut::F32(_) => paste(bytemuck::cast_slice(floats), shape, at, dst),
+        // Extremes of small integers, which f32 holds.
+        AnyViewMut::U8(d) => rows(floats, shape, at, d, |f| f as u8),
+        AnyViewMut::I8(d) => rows(floats, shape, at, d, |f| f as i8),
+        AnyViewMut::U16(d) => rows(floats, shape, at, d, |f| f as u16),
+        AnyViewMut::I16(d) => rows(floats, shape, at, d, |f| f as i16),
+        other => crate::with_view!(AnyViewMut, other, d => rows(floats, shape, at, d, |f| Voxel::from_f64(f as f64))),
+    }
 }
 
 /// Cells as plain numbers, plane by plane over the brick.

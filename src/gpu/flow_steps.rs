@@ -174,7 +174,7 @@ impl Window {
         let [nz, ny, _] = from.region.shape();
         let words = (nz * ny * from.pitch * self.read.stored.voxel).div_ceil(4);
         let codes = to.take(words as u64 * 4);
-        let keys = Keys::new(words, self.read.stored, prepared.flipped());
+        let keys = Keys::new(words, self.read.stored, prepared.params().flipped);
         to.dispatch(Shader::SweepCodes, 0, &keys, &[from.bind, codes.into()], keys.threads);
         let part = SweepPart { dst: self.region, src: from.region };
         let sums = job.sums(&part, codes.into(), cap, to)?;

@@ -26,6 +26,23 @@ macro_rules! herk {
     };
 }
 
+/// Gaussians, a thread of each line, made by a file.
+macro_rules! gaussian {
+    ($own:literal) => {
+        composed!(
+            "common",
+            "floats",
+            "pairs",
+            "cells",
+            "entry_first",
+            "entry_next",
+            "gaussian_taps",
+            "gaussian_centres",
+            $own
+        )
+    };
+}
+
 /// The shaders, each with its text and entry points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Shader {
@@ -168,37 +185,14 @@ impl Shader {
             ),
             Shader::Obscurance => composed!("common", "obscurance_narrow", "obscurance"),
             Shader::ObscuranceWide => composed!("common", "obscurance_wide", "obscurance"),
-            Shader::Gaussian => composed!(
-                "common",
-                "floats",
-                "pairs",
-                "cells",
-                "entry_first",
-                "entry_next",
-                "gaussian_taps",
-                "gaussian_centres",
-                "gaussian_mean",
-                "gaussian"
-            ),
+            Shader::Gaussian => gaussian!("gaussian"),
             Shader::GaussianRows => {
-                composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_mean", "gaussian_rows")
+                composed!("common", "floats", "pairs", "cells", "gaussian_taps", "gaussian_rows")
             }
             Shader::Gradient => composed!("common", "gradient"),
             Shader::Order => herk!("window_herk_ahead", "window_thirds", "window_kept"; "window_order"),
             Shader::Moments => herk!("window_herk", "floats", "pairs"; "window_moments"),
-            Shader::GaussianVariance => {
-                composed!(
-                    "common",
-                    "floats",
-                    "pairs",
-                    "cells",
-                    "entry_first",
-                    "entry_next",
-                    "gaussian_taps",
-                    "gaussian_centres",
-                    "gaussian_variance"
-                )
-            }
+            Shader::GaussianVariance => gaussian!("gaussian_variance"),
             Shader::MapPool => composed!("common", "floats", "pairs", "cells", "entry_first", "entry_next", "map_pool"),
             Shader::Finish => composed!("common", "floats", "pairs", "estimators", "window_finish"),
             Shader::Codes => composed!("common", "integers64", "double", "estimators", "window_codes"),

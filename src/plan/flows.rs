@@ -133,7 +133,7 @@ fn has_kernel(graph: &Graph, step: &Step) -> bool {
         && match &step.kind {
             StepKind::Window { params, channels } => Channels::of(params, channels, wire.dtype == DType::F32).is_some(),
             // Ranks are looked up by the host.
-            StepKind::Obscurance { params, .. } => params.ranks.is_none(),
+            StepKind::Obscurance { sweep, .. } => sweep.params().ranks.is_none(),
             StepKind::Gaussian { .. } | StepKind::Gradient { .. } => true,
             _ => false,
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use crate::config::WhereRule;
 use crate::grid::{Affine, Border, DType};
-use crate::kernel::obscurance::{ObscuranceParams, Prepared};
+use crate::kernel::obscurance::Prepared;
 use crate::stage::{
     Bound, CombineKind, GradientWeight, Ties, TransferPoint, WindowChannel, WindowMode, WindowParams, WindowShape,
 };
@@ -154,8 +154,7 @@ pub enum StepKind {
     },
     /// Inputs: density, then colour and normal where present.
     Obscurance {
-        params: ObscuranceParams,
-        /// Made of the parameters for this volume: planning asks it again and again.
+        /// Made for this volume: planning asks it again and again.
         sweep: Arc<Prepared>,
         channels: Vec<ObscuranceChannel>,
         colour: Option<WireId>,

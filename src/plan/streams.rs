@@ -96,7 +96,7 @@ pub fn any(plan: &Plan, group: &Group) -> bool {
 /// that read 63 times 144 to 170, 82 times 156, 111 times 168, 167 times 227, 226 times 286.
 pub fn work(plan: &Plan, group: &Group, amplification: f64) -> f64 {
     let directions = |s: &StepId| match &plan.graph.steps[*s].kind {
-        StepKind::Obscurance { params, .. } => params.directions as f64,
+        StepKind::Obscurance { sweep, .. } => sweep.params().directions as f64,
         _ => 0.0,
     };
     let swept = group.steps.iter().map(directions).fold(0.0, f64::max);

@@ -85,6 +85,7 @@ impl<'a> Engine<'a> {
         scratch: &mut Scratch,
     ) -> Result<Vec<Value>> {
         let step = &self.plan.graph.steps[id];
+        let StepKind::Obscurance { sweep, .. } = &step.kind else { unreachable!("only sweeps are streamed") };
         let wire = &self.plan.graph.wires[step.outputs[0]];
         let mut openness = self.buffers(DType::F32, region, 1);
         let mut read = |part: Region, dst: AnyViewMut| self.fetched(step, part, dst, fetch);
@@ -98,7 +99,7 @@ impl<'a> Engine<'a> {
             openness: Some(view_mut(&mut openness, 0)),
             rgb: None,
         };
-        let done = self.sweeps[&id].sweep_streamed(src, region, volume, io, &mut read, &mut cx)?;
+        let done = sweep.sweep_streamed(src, region, volume, io, &mut read, &mut cx)?;
         self.metrics.lines(id, done.lines);
         if done.flat
             && self.skip

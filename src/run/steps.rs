@@ -1,8 +1,5 @@
 //! Runs one step of the graph on one brick: cuts what the kernel may see, applies the border rule and the mask.
 
-use std::collections::HashMap;
-use std::sync::Arc;
-
 use super::lanes::gradient_out;
 use super::metrics::Metrics;
 use super::repair;
@@ -15,7 +12,6 @@ use crate::gpu::Gpu;
 use crate::gpu::slopes::Fit;
 use crate::grid::{Affine, AnyViewMut, Border, DType, Region, ViewMut, Voxel};
 use crate::kernel::moments4::{BoundOut, Codes};
-use crate::kernel::obscurance::Prepared;
 use crate::kernel::simd::Level;
 use crate::kernel::window::{Place, WindowOut};
 use crate::kernel::{Context, gaussian, gradient, levels, mask, moments4, pointwise, rank, window};
@@ -27,7 +23,6 @@ use crate::stage::WindowParams;
 pub struct Engine<'a> {
     pub plan: &'a Plan,
     pub level: Level,
-    pub sweeps: HashMap<StepId, Arc<Prepared>>,
     /// Results of the pre-passes so far.
     pub globals: Vec<Vec<f64>>,
     /// Constants are propagated instead of computed.
@@ -51,13 +46,7 @@ pub enum MaskValue {
 
 impl<'a> Engine<'a> {
     pub fn new(plan: &'a Plan, pool: &'a Pool, gpu: Option<&'a Gpu>, metrics: &'a Metrics, skip: bool) -> Engine<'a> {
-        let sweeps = (plan.graph.steps.iter().enumerate())
-            .filter_map(|(i, s)| match &s.kind {
-                StepKind::Obscurance { sweep, .. } => Some((i, sweep.clone())),
-                _ => None,
-            })
-            .collect();
-        Engine { plan, level: Level::detect(), sweeps, globals: Vec::new(), skip, pool, gpu, metrics }
+        Engine { plan, level: Level::detect(), globals: Vec::new(), skip, pool, gpu, metrics }
     }
 
     /// The mask of a step over `region`, from its wire's value.
@@ -204,8 +193,7 @@ impl<'a> Engine<'a> {
         let mut cx = Context { level: self.level, scratch };
         let input_wire = &self.plan.graph.wires[step.inputs[0]];
         match &step.kind {
-            StepKind::Obscurance { channels, colour, normal, .. } => {
-                let sweep = &self.sweeps[&id];
+            StepKind::Obscurance { sweep, channels, colour, normal } => {
                 self.sweep(
                     id,
                     sweep,

@@ -119,16 +119,20 @@ class Case:
         elif op == "obscurance":
             stage |= {"directions": self.pick(12, 42), "rho": self.pick("step", "linear", "exponential", "sqrt"),
                       "max_distance": self.pick(2.0, 5.0, 64.0), "solid": self.pick("high", "low")}
-        elif op == "transfer":
-            stage["points"] = [[x] + self.rng.random(4).round(3).tolist() for x in (-50.0, 0.25, 0.75, 90.0)]
-        elif op == "combine":
-            stage["op_kind"] = self.pick("add", "multiply", "min", "max", "mean")
-        elif op == "window":
-            stage |= {"low": 0.2013, "high": 0.7017, "mode": self.pick("keep", "stretch")}
+        self.set_point(stage)
         finite = self.fields["a"].scaled[self.fields["a"].valid]
         if self.chance(0.3) and finite.size:
             stage |= {"where": {"input": "a", self.pick("min", "max"): float(np.quantile(finite, 0.4)) + 0.0625}, "fill": self.pick(0.25, -7.0)}
         self.keep_stage(name, stage)
+
+    def set_point(self, stage):
+        """What stages that look at one voxel take; others nothing."""
+        if stage["op"] == "transfer":
+            stage["points"] = [[x] + self.rng.random(4).round(3).tolist() for x in (-50.0, 0.25, 0.75, 90.0)]
+        elif stage["op"] == "combine":
+            stage["op_kind"] = self.pick("add", "multiply", "min", "max", "mean")
+        elif stage["op"] == "window":
+            stage |= {"low": 0.2013, "high": 0.7017, "mode": self.pick("keep", "stretch")}
 
     def fail(self, what):
         self.failures.append(what)

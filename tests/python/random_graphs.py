@@ -74,17 +74,12 @@ class Graph(Case):
             stage |= {"scale": self.pick("none", "max")} if op == "saliency" else {}
         elif op == "obscurance":
             more = self.set_sweep(stage, colours)
-        elif op == "transfer":
-            stage["points"] = [[x] + self.rng.random(4).round(3).tolist() for x in (-50.0, 0.25, 0.75, 90.0)]
-        elif op == "combine":
-            stage["op_kind"] = self.pick("add", "multiply", "min", "max", "mean")
-        elif op == "window":
-            stage |= {"low": 0.2013, "high": 0.7017, "mode": self.pick("keep", "stretch")}
         elif op == "opacity_modulation":
             stage["by"] = self.pick(*self.names)
             stage |= {"sigma_max2": self.pick(0.3, 50.0)} if self.chance(0.5) else {"threshold": 0.2013, "gain": self.pick(0.5, 2.0)}
         elif op == "ambient_light":
             stage |= {"rgb": self.pick(*colours), "k": self.pick(1.0, 0.7, 2.5)}
+        self.set_point(stage)
         if self.chance(0.4):
             self.set_where(stage)
         self.keep_stage(name, stage, *more)

@@ -8,7 +8,7 @@ use crate::stage::{DirectionSet, Rho, directions};
 pub(super) const MAX_REACH: usize = 1 << 20;
 
 /// One of the two ways along the lines of a [`Family`].
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sense {
     /// Physical unit vector, `[z, y, x]`.
     pub direction: [f64; 3],
@@ -20,7 +20,7 @@ pub(super) struct Sense {
 }
 
 /// Parallel lines that tile the volume. Opposite directions share them: `D(k)` is the same number for both.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Family {
     /// Dominant axis, 0 = z.
     pub axis: usize,

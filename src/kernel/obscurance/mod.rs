@@ -79,7 +79,7 @@ pub struct ObscuranceParams {
 }
 
 /// Directions, lines and tables made once from the parameters.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Prepared {
     params: ObscuranceParams,
     families: Vec<lines::Family>,
@@ -105,13 +105,6 @@ pub struct ObscuranceIo<'a> {
     pub openness: Option<AnyViewMut<'a>>,
     /// f32, the output box. Asks for `colour`.
     pub rgb: Option<[AnyViewMut<'a>; 3]>,
-}
-
-/// It is made of the parameters alone.
-impl PartialEq for Prepared {
-    fn eq(&self, other: &Prepared) -> bool {
-        self.params == other.params
-    }
 }
 
 impl Prepared {

@@ -1,9 +1,9 @@
 //! What another device needs for a sweep: lines and tables, voxels as codes, and sums to openness. All in the fixed point
 //! of this kernel, so that the bits are the same.
 
-use super::Prepared;
 use super::keys::{self, Code, Coded, with_key};
 use super::lines::{self, Family};
+use super::{ObscuranceParams, Prepared};
 use crate::grid::{AnyView, DType, View};
 use crate::with_view;
 
@@ -88,9 +88,9 @@ impl Prepared {
         self.total as u32
     }
 
-    /// Whether smaller is denser.
-    pub fn flipped(&self) -> bool {
-        self.params.flipped
+    /// What it was made of.
+    pub fn params(&self) -> &ObscuranceParams {
+        &self.params
     }
 }
 

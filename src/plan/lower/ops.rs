@@ -166,7 +166,7 @@ impl Lowering<'_> {
             .map(|c| if *c == "openness" { ObscuranceChannel::Openness } else { ObscuranceChannel::Rgb })
             .collect();
         let inputs = [Some(src), colour, normal].into_iter().flatten().collect();
-        let kind = StepKind::Obscurance { params, sweep, channels, colour, normal };
+        let kind = StepKind::Obscurance { sweep, channels, colour, normal };
         self.push_step(index, node, kind, inputs, reach, Border::Clip, wanted)
     }
 

@@ -137,9 +137,7 @@ enum Files {
 impl Sink {
     /// Folder beside the output that marks it as this program's and holds what is unfinished.
     pub fn work_dir(path: &Path) -> PathBuf {
-        let mut name = path.file_name().unwrap_or_default().to_os_string();
-        name.push(".occlude");
-        path.with_file_name(name)
+        crate::config::check::work_folder(path)
     }
 
     /// Starts an output: makes folders and metadata (without `complete`). With `resume`, keeps what is committed and drops
