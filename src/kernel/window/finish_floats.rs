@@ -57,7 +57,7 @@ pub fn finish_floats(
         let to = [lo[0] + z, lo[1] + y, lo[2]];
         let centre = [at[0] + to[0], at[1] + to[1], at[2] + to[2]];
         let v = &src.row_at(centre[0], centre[1])[centre[2]..][..nx];
-        emit_row(&mut emit, Row { v, lo: least, hi: greatest, s: sums, m: m2, skip: 0 }, to, true);
+        emit_row(&mut emit, Row { v, lo: least, hi: greatest, s: sums, m: m2, whole: None, skip: 0 }, to, true);
     }
 }
 

@@ -11,6 +11,7 @@ use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness
 use super::extremes::{blocked, deep_len, rows_extremes};
 use super::float_estimate as est;
 use super::float_power::{self, Centre, Windows};
+use super::float_spread::{self, Spreads};
 use super::lines::{self, Coding, Elem, Masked, Pitches, Sources};
 use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};
@@ -106,13 +107,28 @@ fn existing(tile: &Tile) -> usize {
 }
 
 crate::multiversion! {
-    fn any_nan[T: Float](row: &[T]) -> bool = any_nan_inner;
+    /// Whether a row has a NaN or an infinity.
+    fn any_odd[T: Float](row: &[T]) -> bool = any_odd_inner;
 }
 
 #[inline(always)]
-#[allow(clippy::eq_op)]
-fn any_nan_inner<T: Float>(row: &[T]) -> bool {
-    row.iter().fold(false, |any, v| any | (*v != *v))
+fn any_odd_inner<T: Float>(row: &[T]) -> bool {
+    // The ends of the order are infinities.
+    !row.iter().fold(true, |all, v| all & (*v < T::GREATEST) & (*v > T::LEAST))
+}
+
+/// Whether there are NaN, and infinities.
+fn odd_voxels<T: Float>(level: Level, src: View<T>) -> (bool, bool) {
+    let rows = (0..src.shape[0]).flat_map(|z| (0..src.shape[1]).map(move |y| src.row_at(z, y)));
+    let (mut nan, mut infinite) = (false, false);
+    for row in rows.filter(|row| any_odd(level, row)) {
+        nan |= row.iter().any(|v| v.to_f64().is_nan());
+        infinite |= row.iter().any(|v| v.to_f64().is_infinite());
+        if nan && infinite {
+            break;
+        }
+    }
+    (nan, infinite)
 }
 
 /// Runs every tile of a call, with [`bytes`] of scratch.
@@ -128,8 +144,10 @@ pub fn run<T: Float>(
     let needs = Needs::of(outs.iter().map(|o| o.channel), true);
     let job = &Job::new(src.shape, dst, place, params, needs, plan::batch_bytes(T::DTYPE, needs));
     assert!(job.counts().0 < 1 << 31, "windows of {} voxels", job.counts().0);
-    let rows = (0..src.shape[0]).flat_map(|z| (0..src.shape[1]).map(move |y| (z, y)));
-    let counts = rows.into_iter().any(|(z, y)| any_nan(level, src.row_at(z, y)));
+    let (counts, infinite) = odd_voxels(level, src);
+    // Openness by the spread asks them whether a window is constant, which the M2 of finite f32 says as well.
+    let asked = Needs::of(outs.iter().map(|o| o.channel), false).extremes;
+    let ends = needs.extremes && (asked || infinite || T::Total::PAIR);
     let wanted = Wanted { pairs: T::Total::PAIR, variance: needs.variance, counts };
     let bytes = &mut &mut *bytes;
     let mut emit = Emit::new(outs, params, level, [job.tile[1]; 2], bytes);
@@ -139,7 +157,9 @@ pub fn run<T: Float>(
     let mut extremes = Extremes::<T>::cut(job, bytes);
     let mut sums = needs.mean.then(|| Buffers::<T::Total>::cut(job, wanted, bytes));
     for x in (0..job.dst[2]).step_by(job.tile[1]) {
-        extremes.clear();
+        if ends {
+            extremes.clear();
+        }
         if let Some(sums) = &mut sums {
             sums.columns.clear();
         }
@@ -150,7 +170,9 @@ pub fn run<T: Float>(
             if y == 0 {
                 lines.aim(job, z0, nothing);
             }
-            extremes.keep(job, &tile, kept);
+            if ends {
+                extremes.keep(job, &tile, kept);
+            }
             if let Some(sums) = &mut sums {
                 sums.keep(job, &tile, kept, z0);
             }
@@ -158,7 +180,9 @@ pub fn run<T: Float>(
                 let exists = j >= tile.rows.0;
                 if exists {
                     lines.fill(&tile, src, j);
-                    extremes.planes(level, job, &tile, j, &lines);
+                    if ends {
+                        extremes.planes(level, job, &tile, j, &lines);
+                    }
                 }
                 if let Some(sums) = sums.as_mut().filter(|_| exists) {
                     sums.planes(level, wanted, job, &tile, z0, j, &lines);
@@ -169,7 +193,7 @@ pub fn run<T: Float>(
                     sums.rows(level, wanted, job, &tile, z - z0);
                 }
                 for j in 0..tile.size[0] {
-                    if needs.extremes {
+                    if ends {
                         extremes.row(level, job, &tile, z - z0, j);
                     }
                     if let Some(sums) = &mut sums {
@@ -189,12 +213,14 @@ pub fn run<T: Float>(
                     let [v_z, v_y, v_x] = std::array::from_fn(|a| (job.at[a] + at[a] as isize) as usize);
                     let len = tile.size[1] - from;
                     let (s, m) = sums.as_ref().map_or((&[][..], &[][..]), |s| s.row(j % BLOCK, job.tile[1]));
+                    let of_whole = sums.as_ref().map(|s| [&*s.whole, &*s.inverse].map(|r| plan::tail(r, from)));
                     let row = Row {
                         v: &src.row_at(v_z, v_y)[v_x..v_x + len],
-                        lo: plan::tail(extremes.out_lo, from),
-                        hi: plan::tail(extremes.out_hi, from),
+                        lo: if ends { plan::tail(extremes.out_lo, from) } else { &[] },
+                        hi: if ends { plan::tail(extremes.out_hi, from) } else { &[] },
                         s: plan::tail(s, from),
                         m: plan::tail(m, from),
+                        whole: of_whole,
                         skip: from,
                     };
                     emit_row(&mut emit, row, std::array::from_fn(|a| at[a] - job.skip[a]), counts);
@@ -222,13 +248,15 @@ fn empty_rows(job: &Job, tile: &Tile, kept: usize, plane: usize) -> impl Iterato
     rows.into_iter().filter(|r| r.start < r.end).map(move |r| plane + r.start * pitch..plane + r.end * pitch)
 }
 
-/// Finished windows of one row.
+/// Finished windows of one row; what no channel needs may be empty.
 pub struct Row<'a, T: Float> {
     pub v: &'a [T],
     pub lo: &'a [T],
     pub hi: &'a [T],
     pub s: &'a [T::Total],
     pub m: &'a [f64],
+    /// Voxels of the windows where none is missing, and their reciprocals, if they are known.
+    pub whole: Option<[&'a [f64]; 2]>,
     /// Counts of the row start there in `Emit::numerator`.
     pub skip: usize,
 }
@@ -237,12 +265,17 @@ pub struct Row<'a, T: Float> {
 pub fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: bool) {
     let (level, len) = (emit.level, row.v.len());
     let n = &emit.numerator[row.skip..row.skip + len];
-    let needs = Needs::of(emit.outs.iter().map(|o| o.channel), true);
-    if emit.outs.iter().any(|o| matches!(o.channel, WindowChannel::Mean | WindowChannel::Moment2)) {
+    use WindowChannel::{Mean, Moment2, Std, Variance};
+    if emit.outs.iter().any(|o| matches!(o.channel, Mean | Moment2)) {
         est::mean_row(level, row.s, n, &mut emit.mean[..len]);
     }
-    if needs.variance {
-        est::variance_row(level, row.m, n, &mut emit.variance[..len]);
+    if emit.outs.iter().any(|o| matches!(o.channel, Variance | Std | Moment2)) {
+        let variance = &mut emit.variance[..len];
+        match row.whole {
+            None => est::variance_row(level, row.m, n, variance),
+            Some([_, inverse]) if !masked => est::whole_variance_row(level, row.m, inverse, variance),
+            Some([whole, inverse]) => est::gapped_variance_row(level, row.m, n, whole, inverse, variance),
+        }
     }
     let affine = emit.params.affine;
     for out in emit.outs.iter_mut() {
@@ -250,13 +283,16 @@ pub fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: 
         match channel {
             WindowChannel::Openness(method, ties) => {
                 let polarity = polarity(emit.params, ties);
-                let (v, lo, hi) = (row.v, &row.lo[..len], &row.hi[..len]);
+                let (v, [lo, hi]) = (row.v, [row.lo, row.hi].map(|e| &e[..len.min(e.len())]));
+                let ends = (lo.len() == len).then_some([lo, hi]);
                 let fill = |o: &mut [f32]| match estimator(method) {
                     Estimator::Power => {
                         float_power::cdf_power(level, &Windows { v, lo, hi, s: row.s, n }, polarity, o);
                     }
                     Estimator::Beta => est::beta_row(level, v, lo, hi, row.s, row.m, n, polarity, o),
-                    Estimator::Spread(kind) => est::spread_row(level, kind, v, lo, hi, row.s, row.m, n, polarity, o),
+                    Estimator::Spread(kind) => {
+                        float_spread::spread_row(level, kind, &Spreads { v, ends, s: row.s, m: row.m, n }, polarity, o);
+                    }
                 };
                 put_openness(level, &mut out.dst, at, len, emit.open, fill);
             }
@@ -336,9 +372,6 @@ impl<'a, T: Float> Extremes<'a, T> {
 
     /// Over z, buffer row `j` of all planes of a batch. NaN never wins a comparison, so it does not count.
     fn planes(&mut self, level: Level, job: &Job, tile: &Tile, j: usize, lines: &Lines<T>) {
-        if self.lo.is_empty() {
-            return;
-        }
         let plain = Coding { flip: T::default(), missing: T::default() };
         let (masked, sources, blocks) = (Masked::<false>, Sources::<false>, (job.batch, job.block));
         let (cols, out) = (tile.columns(), (j * job.narrow, job.narrow_plane()));
@@ -376,6 +409,11 @@ struct Buffers<'a, A> {
     weights: [Weights<'a>; 3],
     /// Lines in the windows of each output, by axis.
     counts: [&'a mut [f64]; 3],
+    /// Voxels of the windows of a row where none is missing, and their reciprocals, which differ from row to row only where
+    /// `section`, the lines along x of a window, does.
+    whole: &'a mut [f64],
+    inverse: &'a mut [f64],
+    section: f64,
 }
 
 impl<'a, A: Sum> Buffers<'a, A> {
@@ -398,7 +436,7 @@ impl<'a, A: Sum> Buffers<'a, A> {
             let [groups, blocks, kinds] = Weights::lens(job.window[a], outputs / BLOCK);
             padded::<Weight>(groups) + padded::<Weight>(blocks) + padded::<u32>(kinds) + padded::<f64>(outputs)
         };
-        moments + padded::<A>(job.tile[1]) + (0..3).map(of_axis).sum::<usize>()
+        moments + padded::<A>(job.tile[1]) + 2 * padded::<f64>(job.tile[1]) + (0..3).map(of_axis).sum::<usize>()
     }
 
     fn cut(job: &Job, wanted: Wanted, bytes: &mut &'a mut [u8]) -> Self {
@@ -412,7 +450,8 @@ impl<'a, A: Sum> Buffers<'a, A> {
         };
         let [(wz, nz), (wy, ny), (wx, nx)] = [0, 1, 2].map(&mut weights);
         let (weights, counts) = ([wz, wy, wx], [nz, ny, nx]);
-        Buffers { planes, columns, rows, totals, groups, weights, counts }
+        let (whole, inverse) = (cut(bytes, job.tile[1]), cut(bytes, job.tile[1]));
+        Buffers { planes, columns, rows, totals, groups, weights, counts, whole, inverse, section: f64::NAN }
     }
 
     /// Weights and counts along an axis for outputs from `start` on.
@@ -429,6 +468,7 @@ impl<'a, A: Sum> Buffers<'a, A> {
             self.aim(job, 0, z0);
             if z0 == 0 {
                 self.aim(job, 2, tile.x);
+                self.section = f64::NAN;
             }
         }
         self.aim(job, 1, tile.y);
@@ -500,17 +540,21 @@ impl<'a, A: Sum> Buffers<'a, A> {
         moments::pass_turned(level, wanted, &pass, &mut self.groups, &mut self.rows);
     }
 
-    /// Row `i` of a block in its final units: M2, and voxels in `n`; `section` are the lines of x of a window.
+    /// Row `i` of a block in its final units: M2, and voxels in `n`; `section` are the lines along x of a window.
     fn finish(&mut self, level: Level, wanted: Wanted, i: usize, section: f64, width: usize, n: &mut [f64]) {
         let rows = self.rows.part(i * width..(i + 1) * width);
         let n = &mut n[..width];
+        if section != self.section {
+            est::whole_row(level, &self.counts[2][..width], section, self.whole, self.inverse);
+            self.section = section;
+        }
         est::totals_row(level, rows.s, rows.t, self.totals);
         match wanted.counts {
-            true => est::counts_row(level, rows.n, &self.counts[2][..width], section, n),
-            false => est::whole_counts_row(level, &self.counts[2][..width], section, n),
+            true => est::counts_row(level, rows.n, self.whole, n),
+            false => n.copy_from_slice(&self.whole[..width]),
         }
         if wanted.variance {
-            est::settle_row(level, self.totals, n, &self.counts[2][..width], section, rows.m);
+            est::settle_row(level, self.totals, n, self.whole, self.inverse, rows.m);
         }
     }
 

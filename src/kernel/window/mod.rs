@@ -21,6 +21,7 @@ pub mod finish_floats;
 mod float;
 mod float_estimate;
 mod float_power;
+mod float_spread;
 mod int;
 mod lines;
 #[doc(hidden)]

@@ -262,6 +262,12 @@ fn hostile_floats() {
             3,
         );
         check("one ulp", &make(dtype, shape, |i| if i == 1203 { 0.999_999_94 } else { 1.0 }), shape, &p, 1);
+        let gaps = |i: usize| match i {
+            1203 => 0.999_999_94,
+            i if i % 7 == 3 => f64::NAN,
+            _ => 1.0,
+        };
+        check("one ulp beside gaps", &make(dtype, shape, gaps), shape, &p, 1);
         check("huge", &make(dtype, shape, |_| 1e36 * n()), shape, &p, 5);
     }
     check("offset 1e15", &make(DType::F64, shape, |_| 1e15 + (10.0 * n()).round()), shape, &p, 3);

@@ -25,7 +25,7 @@ mod spread;
 mod tests;
 
 pub use power::{STRIP, Strip, cdf_power_rows, powers};
-pub use spread::{Squares, spread_rows};
+pub use spread::{CHEBYSHEV, GAUSSIAN, LITERAL, Squares, spread_rows, spread_strip};
 
 /// Windows of consecutive rows: row `k` of the centres (codes before `flip`) starts at `k * v_pitch`, of the counts `n` at
 /// `k * n_pitch`, of everything else at `k * pitch`.

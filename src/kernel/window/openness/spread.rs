@@ -12,9 +12,9 @@ crate::on_singles! {
     ) = spread_inner[T, X1, X2, O, KIND, NARROW];
 }
 
-const GAUSSIAN: usize = 0;
-const CHEBYSHEV: usize = 1;
-const LITERAL: usize = 2;
+pub const GAUSSIAN: usize = 0;
+pub const CHEBYSHEV: usize = 1;
+pub const LITERAL: usize = 2;
 
 /// Sums of squares of the windows of [`Rows`], and how exact numerators are made of them.
 #[derive(Clone, Copy)]
@@ -102,7 +102,6 @@ fn spread<L: F32x32, T: Code, X1: RowSum, O: Openness, const KIND: usize, const 
     let len = out.len();
     let (v, s1, n, numerator) = (&row.v[..len], &row.s1[..len], &row.n[..len], &numerator[..len]);
     assert!(len >= SINGLES);
-    let zero = L::splat(0.0);
     // What is made below is S1 - n v.
     let sign = L::splat(if polarity.flipped { scale } else { -scale });
     blocks!(len, |at| {
@@ -122,23 +121,44 @@ fn spread<L: F32x32, T: Code, X1: RowSum, O: Openness, const KIND: usize, const 
         };
         // SAFETY: as above.
         let m = unsafe { L::load(numerator.as_ptr().add(at)) };
-        let flat = m.equals(zero);
+        let flat = m.equals(L::splat(0.0));
         let (d, m) = (d.times(sign), m.times(L::splat(scale * scale)));
-        let constant = L::splat(polarity.constant);
-        let y = if L::all(flat) {
-            constant
-        } else {
-            let y = match KIND {
-                GAUSSIAN => phi(d, m),
-                // 1 - m / (m + d^2) without the cancellation
-                CHEBYSHEV => d.greater(zero).times(d.greater(zero)).over(d.fused(d, m)),
-                _ => L::pick(zero.is_below(d), m.over(d.fused(d, m)), L::splat(1.0)),
-            };
-            L::pick(flat, constant, y)
-        };
+        let y = opened::<L, KIND>(d, m, flat, L::splat(polarity.constant));
         // SAFETY: as above.
         unsafe { O::put(y, out.as_mut_ptr().add(at)) };
     });
+}
+
+/// [`spread_rows`] of at least 32 windows whose numbers are there: `d`, n times what the centre lies above the mean (below it, where
+/// smaller is denser), and `m`, `n^2 variance`, 0 where a window is constant. Products of three of them and of their roots must
+/// be normal.
+#[inline(always)]
+pub fn spread_strip<L: F32x32, const KIND: usize>(d: &[f32], m: &[f32], constant: f32, out: &mut [f32]) {
+    let len = out.len();
+    let (d, m) = (&d[..len], &m[..len]);
+    assert!(len >= SINGLES);
+    blocks!(len, |at| {
+        // SAFETY: `at + 32 <= len`, the length of every slice.
+        let (d, m) = unsafe { (L::load(d.as_ptr().add(at)), L::load(m.as_ptr().add(at))) };
+        let y = opened::<L, KIND>(d, m, m.equals(L::splat(0.0)), L::splat(constant));
+        // SAFETY: as above.
+        unsafe { y.store(out.as_mut_ptr().add(at)) };
+    });
+}
+
+#[inline(always)]
+fn opened<L: F32x32, const KIND: usize>(d: L, m: L, flat: L::Mask, constant: L) -> L {
+    if L::all(flat) {
+        return constant;
+    }
+    let zero = L::splat(0.0);
+    let y = match KIND {
+        GAUSSIAN => phi(d, m),
+        // 1 - m / (m + d^2) without the cancellation
+        CHEBYSHEV => d.greater(zero).times(d.greater(zero)).over(d.fused(d, m)),
+        _ => L::pick(zero.is_below(d), m.over(d.fused(d, m)), L::splat(1.0)),
+    };
+    L::pick(flat, constant, y)
 }
 
 /// The standard normal distribution function of `d / sqrt(m)` by Abramowitz and Stegun 7.1.26, absolute error 4e-7, with one
