@@ -1,7 +1,7 @@
 //! Finds an adapter and opens it: by the system's own way only, ranked by device type, software refused unless asked for by name.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Condvar, Mutex};
+use std::collections::{HashMap, HashSet};
+use std::sync::{Arc, Condvar, Mutex, OnceLock};
 
 use super::backend;
 use super::facts::{GpuFacts, GpuKind, SLOTS};
@@ -13,7 +13,7 @@ pub struct Device {
     pub device: wgpu::Device,
     pub queue: wgpu::Queue,
     /// Made when they are first used.
-    kernels: Mutex<HashMap<Kind, Arc<Kernel>>>,
+    kernels: Mutex<HashMap<Kind, Arc<OnceLock<Arc<Kernel>>>>>,
     /// Nanoseconds of a tick of the time stamps, where they were asked for and there are any.
     pub tick: Option<f64>,
     slots: Mutex<Vec<Slot>>,
@@ -164,8 +164,20 @@ fn kernel(device: &wgpu::Device, kind: Kind) -> Kernel {
 impl Device {
     /// The pipeline of an entry point. What the driver says against it comes through the device's error scopes.
     pub fn kernel(&self, kind: Kind) -> Arc<Kernel> {
-        let mut kernels = self.kernels.lock().unwrap_or_else(|e| e.into_inner());
-        kernels.entry(kind).or_insert_with(|| Arc::new(kernel(&self.device, kind))).clone()
+        let place = self.kernels.lock().unwrap_or_else(|e| e.into_inner()).entry(kind).or_default().clone();
+        place.get_or_init(|| Arc::new(kernel(&self.device, kind))).clone()
+    }
+
+    /// Compiles those that are not there yet side by side: drivers keep what they compiled, but a first run waits for all of
+    /// it. What a driver says against one comes as a fault of the device.
+    pub fn compile(&self, kinds: impl Iterator<Item = Kind>) {
+        let missing: HashSet<Kind> = {
+            let kernels = self.kernels.lock().unwrap_or_else(|e| e.into_inner());
+            kinds.filter(|k| kernels.get(k).is_none_or(|place| place.get().is_none())).collect()
+        };
+        if missing.len() > 1 {
+            std::thread::scope(|scope| missing.iter().for_each(|kind| drop(scope.spawn(|| self.kernel(*kind)))));
+        }
     }
 
     /// Whether a call would have to wait for a slot.

@@ -227,6 +227,7 @@ fn on_device(
     let sizes = recording.sizes;
     let slot = &mut held.slot;
     slot.grow(&device.device, sizes);
+    device.compile(recording.dispatches().map(kind));
     let start = Instant::now();
     map(device, slot.upload.get(), wgpu::MapMode::Write, sizes.upload(), None)?;
     let work = write(slot.upload.get(), recording, fill)?;
@@ -377,8 +378,12 @@ fn encode(
     }
 }
 
+fn kind(d: &Dispatch) -> Kind {
+    Kind { shader: d.shader, entry: d.entry, parts: d.parts }
+}
+
 fn dispatch(device: &Device, held: &SlotGuard, d: &Dispatch, offset: u64, pass: &mut wgpu::ComputePass) {
-    let kernel = device.kernel(Kind { shader: d.shader, entry: d.entry, parts: d.parts });
+    let kernel = device.kernel(kind(d));
     let size = wgpu::BufferSize::new(d.params.len() as u64);
     let params = wgpu::BufferBinding { buffer: held.slot.params.get(), offset, size };
     let mut entries = vec![wgpu::BindGroupEntry { binding: 0, resource: wgpu::BindingResource::Buffer(params) }];
