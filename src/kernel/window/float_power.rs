@@ -5,7 +5,7 @@ use super::estimate::Polarity;
 use super::float_estimate::infinite;
 use super::math;
 use super::merge::{Pair, Sum};
-use super::openness::{STRIP, Strip, powers};
+use super::openness::{STRIP, Strip, padded, powers};
 use crate::grid::Voxel;
 use crate::kernel::simd::Level;
 use crate::kernel::singles::{F32x32, SINGLES};
@@ -98,10 +98,7 @@ crate::on_singles! {
 pub fn cdf_power<T: Centre>(level: Level, row: &Windows<T>, polarity: Polarity, out: &mut [f32]) {
     let len = out.len();
     if len < SINGLES {
-        // As the first values of a row of a block: the last of them again and again.
-        fn padded<E: Copy>(from: &[E], len: usize) -> [E; SINGLES] {
-            std::array::from_fn(|i| from[i.min(len - 1)])
-        }
+        // As the first values of a row of a block.
         if len > 0 {
             let (v, lo, hi) = (padded(row.v, len), padded(row.lo, len), padded(row.hi, len));
             let (s, n, mut all) = (padded(row.s, len), padded(row.n, len), [0.0; SINGLES]);

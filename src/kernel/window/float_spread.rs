@@ -6,7 +6,7 @@ use super::float_estimate::infinite;
 use super::float_power::Centre;
 use super::math;
 use super::merge::Sum;
-use super::openness::{CHEBYSHEV, GAUSSIAN, LITERAL, STRIP, Strip, spread_strip};
+use super::openness::{CHEBYSHEV, GAUSSIAN, LITERAL, STRIP, Strip, padded, spread_strip};
 use crate::kernel::simd::Level;
 use crate::kernel::singles::{F32x32, SINGLES};
 
@@ -46,9 +46,11 @@ impl<'a, T: Centre> Spreads<'a, T> {
     }
 }
 
+/// Positive, and neither subnormal nor infinite nor NaN.
 #[inline(always)]
 fn is_normal(q: f64) -> bool {
-    (q >= f64::MIN_POSITIVE) & (q < f64::INFINITY)
+    let (least, infinite) = (f64::MIN_POSITIVE.to_bits(), f64::INFINITY.to_bits());
+    q.to_bits().wrapping_sub(least) < infinite - least // patterns of bits are ordered as numbers are
 }
 
 crate::on_singles! {
@@ -60,10 +62,7 @@ crate::on_singles! {
 pub fn spread_row<T: Centre>(level: Level, kind: Spread, row: &Spreads<T>, polarity: Polarity, out: &mut [f32]) {
     let len = out.len();
     if len < SINGLES {
-        // As the first values of a row of a block: the last of them again and again.
-        fn padded<E: Copy>(from: &[E], len: usize) -> [E; SINGLES] {
-            std::array::from_fn(|i| from[i.min(len - 1)])
-        }
+        // As the first values of a row of a block.
         if len > 0 {
             let ends = row.ends.map(|ends| ends.map(|e| padded(e, len)));
             let ends = ends.as_ref().map(|[lo, hi]| [&lo[..], &hi[..]]);

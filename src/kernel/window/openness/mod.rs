@@ -131,8 +131,8 @@ fn one_padded<T: Code, X1: RowSum, O: Openness>(
     out.data[k * out.pitch..][..len].copy_from_slice(&all[..len]);
 }
 
-/// The first `len` values and the last of them again.
-fn padded<T: Copy>(from: &[T], len: usize) -> [T; SINGLES] {
+/// The first `len` values, at least one, and the last of them again.
+pub fn padded<T: Copy>(from: &[T], len: usize) -> [T; SINGLES] {
     std::array::from_fn(|i| from[i.min(len - 1)])
 }
 
