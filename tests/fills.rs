@@ -70,3 +70,24 @@ fn a_fill_that_the_channel_cannot_hold_is_told() {
         assert!(!told("mean", fill));
     }
 }
+
+#[test]
+fn an_infinity_takes_no_range_from_the_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [8, 8, 8];
+    let text = "[input.v]\npath = 'v.npy'\n[stage.s]\nop = 'saliency'\ninput = 'v'\nscale = 'max'\nsize = 3\n\
+                [output.codes]\npath = 'codes.npy'\nfrom = 'v'\ndtype = 'u8'\nrange = 'auto'\n\
+                [output.s]\npath = 's.npy'\nfrom = 's'\n";
+    for infinity in [f32::INFINITY, f32::NEG_INFINITY] {
+        let volume = fill(shape, |z, y, x| if [z, y, x] == [4, 4, 4] { infinity } else { (z * 64 + y * 8 + x) as f32 });
+        write_npy(&dir.path().join("v.npy"), "<f4", shape, &f32_bytes(&volume));
+        run(dir.path(), text, &[]);
+        let codes = npy(&dir.path().join("codes.npy"), 1, 512);
+        assert_eq!((codes[0], codes[511], codes[73]), (0, 255, (73.0f32 * 255.0 / 511.0).round() as u16));
+        assert_eq!(codes[4 * 64 + 4 * 8 + 4], if infinity > 0.0 { 255 } else { 0 });
+        let (_, saliency) = &decode(&dir.path().join("s.npy"))["level 0 component 0"];
+        let most = saliency.iter().map(|v| f64::from_bits(*v)).filter(|v| v.is_finite()).fold(0.0, f64::max);
+        assert_eq!(most, 1.0, "{infinity}");
+        ["codes.npy", "s.npy"].iter().for_each(|f| std::fs::remove_file(dir.path().join(f)).unwrap());
+    }
+}

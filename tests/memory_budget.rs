@@ -247,3 +247,65 @@ fn a_chain_decodes_chunks_of_planes_about_once() {
     let read = run(dir.path(), &format!("{limits}[input.a]\npath = 'planes.zarr'\n{CHAIN}"), &[]).bytes_read;
     assert!(read as f64 <= 1.2 * stored as f64, "{read} bytes read of {stored}");
 }
+
+/// The MiB that a refused config asks for; `None` where it is not refused.
+fn asked_for(config: &std::path::Path, memory: &str) -> Option<u64> {
+    let mut command = Command::new(program());
+    command.arg("plan").arg(config).args(["-q", "--memory", memory, "--threads", "1"]);
+    let out = command.output().unwrap();
+    let said = String::from_utf8(out.stderr).unwrap();
+    if out.status.success() {
+        return None;
+    }
+    assert_eq!(out.status.code(), Some(2), "{said}");
+    let number = said.split("at least memory = \"").nth(1).and_then(|s| s.split("MiB").next());
+    Some(number.and_then(|n| n.parse().ok()).unwrap_or_else(|| panic!("no number in {said}")))
+}
+
+#[test]
+fn the_least_that_is_asked_for_does() {
+    let dir = tempfile::tempdir().unwrap();
+    write_npy(&dir.path().join("v.npy"), "<u2", [40, 300, 300], &u16_bytes(&mixed_u16([40, 300, 300])));
+    let path = dir.path().join("config.toml");
+    for (border, radius, out) in
+        [("reflect", 100, "o.nrrd"), ("nearest", 30, "o.nrrd"), ("clip", 100, "o.nrrd"), ("nearest", 300, "o.zarr")]
+    {
+        let text = format!(
+            "[input.v]\npath = 'v.npy'\n[stage.s]\nop = 'box'\ninput = 'v'\nradius = {radius}\nborder = '{border}'\n\
+             [output.o]\npath = '{out}'\nfrom = 's.variance'\n"
+        );
+        std::fs::write(&path, text).unwrap();
+        let least = asked_for(&path, "1MiB").expect("refused");
+        assert_eq!(asked_for(&path, &format!("{least}MiB")), None, "{border} {radius} {out}: {least} MiB");
+        assert!(
+            asked_for(&path, &format!("{}MiB", least - 1)).is_some(),
+            "{border} {radius} {out}: less than {least} MiB"
+        );
+    }
+}
+
+/// Chunks as large as a volume, of which only a corner exists; and volumes of one chunk.
+#[test]
+fn large_chunks_count_in_the_budget() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [40, 300, 300];
+    write_npy(&dir.path().join("v.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+    let path = dir.path().join("config.toml");
+    let under = |text: &str, memory: u64| {
+        std::fs::write(&path, text).unwrap();
+        let least = asked_for(&path, &format!("{memory}MiB")).expect("refused");
+        std::fs::write(&path, format!("run.memory = '{least}MiB'\nrun.threads = 1\n{text}")).unwrap();
+        let peak = peak_of_run(&path);
+        println!("peak {} MiB under a budget of {least} MiB", peak / MIB);
+        assert!(peak <= (least + 128) * MIB, "peak {} MiB under {least} MiB", peak / MIB);
+    };
+    under("[input.v]\npath = 'v.npy'\n[output.o]\npath = 'o.zarr'\nfrom = 'v'\nchunk = 512\nshard = 'none'\n", 64);
+    // Noise, so that packed chunks are as large as they can be.
+    let made = "[input.v]\nsynthetic = 'noise'\nshape = [256, 256, 256]\ndtype = 'f32'\n[output.o]\npath = 'one.zarr'\nfrom = 'v'\n\
+                chunk = 256\nshard = 'none'\nlevels = 1\ndtype = 'f32'\n";
+    run(dir.path(), made, &[]);
+    under(
+        "[input.v]\npath = 'one.zarr'\n[stage.s]\nop = 'box'\ninput = 'v'\nradius = 1\n[output.o]\npath = 'o.npy'\nfrom = 's.max'\n",
+        21,
+    );
+}

@@ -82,14 +82,14 @@ pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<(BrickChoic
             );
             Ok((choice, cost))
         }
-        None => Err(refuse(plan, group, least(group), "the smallest", config)),
+        None => Err(refuse(plan, group, least(plan, group), "the smallest", config)),
     }
 }
 
-/// The smallest brick: one chunk where that is small, else the alignment.
-fn least(group: &Group) -> Shape {
-    let shape = group.region.shape();
-    round_up(std::array::from_fn(|a| group.align[a].min(shape[a])), group.align, group.task)
+/// The brick of those that are looked at which takes least memory.
+fn least(plan: &Plan, group: &Group) -> Shape {
+    let all = candidates(group).into_iter();
+    all.min_by_key(|&shape| one_brick(plan, group, shape)[1]).expect("there is a shape")
 }
 
 fn round_up(asked: Shape, align: Shape, task: Shape) -> Shape {
@@ -249,7 +249,7 @@ fn one_brick(plan: &Plan, group: &Group, shape: Shape) -> [u64; 2] {
 
 /// The least budget that would do for a group.
 pub fn least_bytes(plan: &Plan, group: &Group) -> u64 {
-    one_brick(plan, group, least(group))[1]
+    one_brick(plan, group, least(plan, group))[1]
 }
 
 fn refuse(plan: &Plan, group: &Group, shape: Shape, which: &str, config: &Config) -> Error {

@@ -44,15 +44,19 @@ pub fn radius(length: &Length, lattice: &Lattice, key: &str) -> Result<[usize; 3
     }
 }
 
+/// Voxels beyond which a Gaussian is flat over any volume, to every bit of f64; its reach must be an index.
+const FLAT: f64 = 1e15;
+
 /// Real widths in voxels per axis.
 pub fn sigma(length: &Length, lattice: &Lattice, key: &str) -> Result<[f64; 3]> {
-    match length {
-        Length::Voxels(v) => Ok(*v),
+    let sigma = match length {
+        Length::Voxels(v) => *v,
         Length::Physical { value, unit } => {
             let s = physical(*value, unit, lattice, key)?;
-            Ok(lattice.spacing.map(|h| s / h))
+            lattice.spacing.map(|h| s / h)
         }
-    }
+    };
+    Ok(sigma.map(|s| s.min(FLAT)))
 }
 
 /// One distance in voxels of the finest axis.
@@ -92,6 +96,14 @@ mod tests {
         assert_eq!(radius(&r, &lattice([1.0, 10.0, 10.0], Some("millimeter")), "k").unwrap(), [3, 1, 0]);
         assert_eq!(radius(&r, &lattice([1000.0, 500.0, 1.0], Some("micrometer")), "k").unwrap(), [3, 5, 2500]);
         assert!(radius(&r, &lattice([1.0; 3], None), "k").is_err());
+    }
+
+    #[test]
+    fn sigma_is_never_too_wide_to_index() {
+        let wide = lattice([1.0, 1e-308, 1.0], Some("millimeter"));
+        assert_eq!(sigma(&Length::Voxels([2.0, 1e19, 0.5]), &wide, "k").unwrap(), [2.0, FLAT, 0.5]);
+        let s = Length::Physical { value: 2.0, unit: "mm".into() };
+        assert_eq!(sigma(&s, &wide, "k").unwrap(), [2.0, FLAT, 2.0]);
     }
 
     #[test]

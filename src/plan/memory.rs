@@ -265,9 +265,10 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
     written + encoded + cells + map
 }
 
-/// Open chunks of the levels between their first and last brick, for one task, all outputs; and the GPU lane's buffers.
+/// Open chunks of the levels between their first and last brick, for one task, all outputs, and those that are being encoded; and
+/// the GPU lane's buffers.
 pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
-    let mut total = gpu_bytes(plan, group);
+    let (mut total, mut encoding) = (gpu_bytes(plan, group), 0);
     for &o in &group.outputs {
         let output = &plan.outputs[o];
         if !output.is_zarr() {
@@ -277,13 +278,20 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
         let voxel = output.spec.dtype.size() as u64;
         let task: u64 = (0..3).map(|a| group.task[a].min(group.region.shape()[a]) as u64).product();
         for k in 0..=output.brick_level() {
-            let factor: u64 = output.level(k).expect("level exists").factor.iter().map(|&f| f as u64).product();
-            let level = task / factor * voxel * parts;
+            let factor = output.level(k).expect("level exists").factor;
+            // Chunks are whole in memory where the volume ends inside them.
+            let chunks = (0..3).map(|a| {
+                let edge = group.task[a].min(group.region.shape()[a]).div_ceil(factor[a]);
+                edge.div_ceil(output.spec.chunk[a]) as u64
+            });
+            let chunks: u64 = chunks.product();
             // Along the Morton curve, at most the chunks along a brick's longest row wait at once, and about as many again.
             let chunk = output.spec.chunk.iter().map(|&n| n as u64).product::<u64>() * voxel * parts;
             let row = group.brick.shape[2].div_ceil(output.spec.chunk[2]) as u64;
             let whole = k == 0 && (0..3).all(|a| group.brick.shape[a].is_multiple_of(output.spec.chunk[a]));
-            total += if whole { 0 } else { level.min(chunk * 8 * row.max(1)) };
+            total += if whole { 0 } else { chunks.min(8 * row.max(1)) * chunk };
+            // One at a time each worker has one before and after its filters, and as it is compressed.
+            encoding = encoding.max(chunks.min(plan.workers as u64) * (2 * chunk).saturating_sub(PER_THREAD));
         }
         // Cells kept for the second phase, where there is one.
         if output.level_count() > output.brick_level() + 1 {
@@ -292,7 +300,7 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
             total += cells * parts * reduce::bytes_per_cell(output.reduce) as u64;
         }
     }
-    total
+    total + encoding
 }
 
 /// Bricks that are alive at once: one per worker, one being read, one being written.

@@ -44,7 +44,8 @@ impl Finder {
     }
 }
 
-/// Least and largest value so far, NaN and missing voxels apart. Order never matters.
+/// Least and largest value so far of finite voxels that are not missing: an infinity would leave nothing of all others.
+/// Order never matters.
 #[derive(Debug)]
 pub struct MinMax(Mutex<[f64; 2]>);
 
@@ -62,7 +63,9 @@ impl MinMax {
             let (value, wire) = (done.value(w), &plan.graph.wires[w]);
             for (c, comp) in value.comps.iter().enumerate() {
                 let part = match comp {
-                    Comp::Const(v) => (!v.is_nan() && wire.missing.is_none_or(|m| m as f64 != *v)).then_some([*v, *v]),
+                    Comp::Const(v) => {
+                        (v.is_finite() && wire.missing.is_none_or(|m| m as f64 != *v)).then_some([*v, *v])
+                    }
                     Comp::Voxels(_) => extremes(value.view(c, done.brick), wire.missing),
                 };
                 if let Some([a, b]) = part.map(|p| p.map(|v| wire.affine.apply(v))) {
@@ -91,9 +94,7 @@ fn extremes(view: AnyView, missing: Option<i64>) -> Option<[f64; 2]> {
         let mut found: Option<[T; 2]> = None;
         for i in Region::new([0; 3], [v.shape[0] as i64, v.shape[1] as i64, 1]).iter() {
             for &x in v.row_at(i[0] as usize, i[1] as usize) {
-                // NaN equals nothing, itself included.
-                #[allow(clippy::eq_op)]
-                if x != x || missing == Some(x) {
+                if !x.to_f64().is_finite() || missing == Some(x) {
                     continue;
                 }
                 found = Some(match found {

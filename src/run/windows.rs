@@ -1,4 +1,5 @@
-//! Display windows for viewers (`omero`): percentiles of the coarsest level, which is small and already written.
+//! Display windows for viewers (`omero`): percentiles of the full resolution as it was written. Those of a coarse level, whose
+//! means are alike, would leave a third of the voxels of an occlusion map outside.
 
 use crate::brick::Voxels;
 use crate::config::{Input, InputKind, Place, Select};
@@ -9,7 +10,7 @@ use crate::store::source::ChunkRead;
 
 /// Share of voxels that may lie beyond each end.
 const TAIL: f64 = 0.01;
-/// Voxels decoded per component at most, about: larger levels (an explicit `levels = 1`) are sampled by whole chunks.
+/// Voxels decoded per component at most, about: larger volumes are sampled by whole chunks.
 const DECODED: usize = 4 << 20;
 /// Values that a window is chosen from, about: each of its percentiles then lies within 0.05 percent of the voxels decoded.
 const CHOSEN: usize = 1 << 17;
@@ -19,7 +20,7 @@ const CHOSEN: usize = 1 << 17;
 pub fn of_output(output: &OutputPlan) -> Vec<[f64; 2]> {
     let components = output.spec.components.unwrap_or(1);
     let fallback = if output.spec.dtype.is_float() { [0.0, 1.0] } else { output.spec.dtype.range().into() };
-    let source = if output.is_zarr() { Source::open(&coarsest(output)).ok() } else { None };
+    let source = if output.is_zarr() { Source::open(&written(output)).ok() } else { None };
     let mut windows: Vec<[f64; 2]> =
         (0..components).map(|c| source.as_ref().and_then(|s| window(s, c)).unwrap_or(fallback)).collect();
     share_of_colours(&output.spec.component_names, fallback, &mut windows);
@@ -38,12 +39,12 @@ fn share_of_colours(names: &[String], whole: [f64; 2], windows: &mut [[f64; 2]])
     }
 }
 
-fn coarsest(output: &OutputPlan) -> Input {
+fn written(output: &OutputPlan) -> Input {
     Input {
         name: output.spec.name.clone(),
         place: Place::default(),
         kind: InputKind::Path { path: output.spec.path.clone(), raw: None },
-        level: output.spec.pyramid.levels.len() - 1,
+        level: 0,
         array: None,
         channel: Select::All,
         time: Select::Index(0),

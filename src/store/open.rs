@@ -1,15 +1,26 @@
 //! Opening all inputs of a config.
 
 use super::Source;
-use crate::Result;
 use crate::config::Config;
+use crate::{Error, Result};
 
 /// Opens the config's inputs in order, for a run within its budget: headers only. Errors name the line of the key.
 pub fn open_inputs(config: &Config) -> Result<Vec<Source>> {
     let open = |i| {
-        let mut source = Source::open(i).map_err(|e| config.locate(e))?;
+        let mut source = Source::open(i).map_err(|e| said_of(config, &i.name, e))?;
         source.flatten(config.run.memory);
         Ok(source)
     };
     config.inputs.iter().map(open).collect()
+}
+
+/// An error of opening an input with the place in the config that names the file.
+fn said_of(config: &Config, name: &str, error: Error) -> Error {
+    let Error::File { path, message } = error else { return config.locate(error) };
+    let key = format!("input.{name}.path");
+    let Error::Config { file: Some(file), line, .. } = config.locate(Error::config(key.as_str(), "")) else {
+        return Error::File { path, message };
+    };
+    let line = line.map_or(String::new(), |line| format!(":{line}"));
+    Error::File { path, message: format!("{message} ({}{line}: {key})", file.display()) }
 }

@@ -149,7 +149,10 @@ fn open_all(info: &VolumeInfo, lattice: &Lattice, paths: &[PathBuf], exact: bool
         if len < need {
             return Err(Error::file(
                 path,
-                format!("has {len} bytes, but {}: the file is cut off or its header is wrong", what()),
+                format!(
+                    "has {len} bytes, but {}: the file is cut off or its header is wrong (raw: shape, dtype, offset)",
+                    what()
+                ),
             ));
         }
         if exact && len > need {

@@ -141,7 +141,11 @@ impl Packed {
         let want = self.skip + self.len;
         Error::file(
             &self.path,
-            format!("the {} data expand to {found} bytes, but the header says {want}", self.packing.name()),
+            format!(
+                "the {} data expand to {found} bytes, but the header says {want} (raw: shape, dtype, offset; bytes that follow are \
+                 allowed with trailing = \"ignore\")",
+                self.packing.name()
+            ),
         )
     }
 }

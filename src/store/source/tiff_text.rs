@@ -162,13 +162,11 @@ fn ome(path: &Path, xml: &str, plain: Described) -> Result<Described> {
         let named = attribute(pixels, &format!("PhysicalSize{axis}Unit")).map(unescape);
         length(axis).map(|_| named.map_or(Some("micrometer".into()), |u| units::normalise(&u)))
     };
-    let mut known = ["X", "Y", "Z"].into_iter().filter_map(unit);
-    described.unit = known.next().flatten();
-    if known.any(|u| u != described.unit) {
-        return Err(Error::file(path, "the OME description gives x, y and z different units; one is expected"));
-    }
+    described.unit = ["X", "Y", "Z"].into_iter().find_map(unit).flatten();
     for (i, axis) in ["Z", "Y", "X"].into_iter().enumerate() {
-        described.spacing[i] = length(axis).filter(|v| v.is_finite() && *v > 0.0).unwrap_or(1.0);
+        let own = unit(axis).unwrap_or_else(|| described.unit.clone());
+        let factor = units::to_one(described.unit.as_deref(), own.as_deref()).map_err(|why| Error::file(path, why))?;
+        described.spacing[i] = length(axis).filter(|v| v.is_finite() && *v > 0.0).map_or(1.0, |v| v * factor);
     }
     described.labels =
         tags(body, "Channel").map(|(b, _)| attribute(b, "Name").map(unescape).unwrap_or_default()).collect();

@@ -16,6 +16,7 @@ use super::chunk_codecs;
 use super::planar::key;
 use super::planar::{components, shape_of};
 use super::shards::{Shard, Shards};
+use super::units;
 use super::zarr_meta::{self, ArrayMeta, Multiscale, ShardMeta};
 use crate::brick::Voxels;
 use crate::config::Input;
@@ -174,7 +175,7 @@ fn other_order(meta: &ArrayMeta, multiscale: Option<&Multiscale>, lead: usize) -
 
 /// Spacing, origin and unit of the space axes.
 fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut VolumeInfo) -> Result<()> {
-    let mut unit: Option<Option<String>> = None;
+    let mut first: Option<Option<String>> = None;
     for a in lead..n {
         let i = 3 - (n - a);
         info.spacing[i] = m.scale.get(a).copied().unwrap_or(1.0);
@@ -183,15 +184,12 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
             info.spacing[i] = 1.0;
         }
         let own = m.axes.get(a).and_then(|axis| axis.2.clone());
-        if unit.as_ref().is_some_and(|u| *u != own) {
-            return Err(Error::file(
-                path,
-                format!("the space axes have different units ({unit:?}, {own:?}); one is expected"),
-            ));
-        }
-        unit = Some(own);
+        let unit = first.get_or_insert_with(|| own.clone());
+        let factor = units::to_one(unit.as_deref(), own.as_deref()).map_err(|why| Error::file(path, why))?;
+        info.spacing[i] *= factor;
+        info.origin[i] *= factor;
     }
-    info.unit = unit.flatten();
+    info.unit = first.flatten();
     Ok(())
 }
 
