@@ -6,13 +6,12 @@
 
 use std::ops::Range;
 
-use super::along::SLACK;
 use super::emit::{Emit, Estimator, estimator, polarity, put_moment, put_openness, repair};
-use super::extremes::{blocked, deep_len, rows_extremes};
 use super::float_estimate as est;
+use super::float_extremes::Extremes;
 use super::float_power::{self, Centre, Windows};
 use super::float_spread::{self, Spreads};
-use super::lines::{self, Coding, Elem, Masked, Pitches, Sources};
+use super::lines::Elem;
 use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};
 use super::parts::{BLOCK, Weights};
@@ -48,12 +47,12 @@ pub fn bytes<T: Float>(job: &Job) -> usize {
 /// The lines along z of one buffer row of a batch, side by side, from [`first`] column on: planes lie a power of two apart in many volumes, and then
 /// few cache sets hold all of a column, which extremes and sums both read. 2-core Zen 4 VM, AVX-512, 2026-11-23, 256 x 256
 /// planes, cdf_power r=10 of f32: 12.9 ns/voxel in place, 11.4 and 10.0 staged, in runs of their own on a busy machine.
-struct Lines<'a, T> {
-    buffer: &'a mut [T],
-    pitch: usize,
+pub struct Lines<'a, T> {
+    pub buffer: &'a mut [T],
+    pub pitch: usize,
     /// Source plane of line 0, and lines that exist.
     first: isize,
-    exist: (usize, usize),
+    pub exist: (usize, usize),
 }
 
 impl<'a, T: Float> Lines<'a, T> {
@@ -97,7 +96,7 @@ fn width(job: &Job) -> usize {
 
 /// First column of a tile that sums are made for: the eight that hold its first column that exists. What lies outside is
 /// nothing, and costs nothing.
-fn first(tile: &Tile) -> usize {
+pub fn first(tile: &Tile) -> usize {
     tile.cols.0 / LANES * LANES
 }
 
@@ -237,12 +236,12 @@ fn corners(job: &Job) -> impl Iterator<Item = (usize, usize)> + '_ {
 }
 
 /// The last `kept` rows of the buffer of the tile above, in the plane at `plane`; they become the first of this tile's.
-fn made_above(job: &Job, kept: usize, plane: usize) -> Range<usize> {
+pub fn made_above(job: &Job, kept: usize, plane: usize) -> Range<usize> {
     plane + job.tile[0] * job.narrow..plane + (job.tile[0] + kept) * job.narrow
 }
 
 /// Rows after the kept ones that do not exist, as elements of the plane at `plane`.
-fn empty_rows(job: &Job, tile: &Tile, kept: usize, plane: usize) -> impl Iterator<Item = Range<usize>> {
+pub fn empty_rows(job: &Job, tile: &Tile, kept: usize, plane: usize) -> impl Iterator<Item = Range<usize>> {
     let pitch = job.narrow;
     let rows = [kept..tile.rows.0, tile.rows.1.max(kept)..job.height];
     rows.into_iter().filter(|r| r.start < r.end).map(move |r| plane + r.start * pitch..plane + r.end * pitch)
@@ -307,92 +306,6 @@ pub fn emit_row<T: Float>(emit: &mut Emit, row: Row<T>, at: [usize; 3], masked: 
         if masked {
             repair(&mut out.dst, at, len, |x| row.v[x].to_f64().is_nan());
         }
-    }
-}
-
-/// Minimum and maximum on their way through the three axes.
-struct Extremes<'a, T> {
-    lo: &'a mut [T],
-    hi: &'a mut [T],
-    row_lo: &'a mut [T],
-    row_hi: &'a mut [T],
-    work: &'a mut [T],
-    deep: &'a mut [T],
-    out_lo: &'a mut [T],
-    out_hi: &'a mut [T],
-}
-
-impl<'a, T: Float> Extremes<'a, T> {
-    /// Planes, rows (twice each), work, deep work, results (twice).
-    fn lens(job: &Job) -> [usize; 5] {
-        let k = job.needs.extremes as usize;
-        [
-            job.batch * job.narrow_plane(),
-            job.rows * job.pitch + SLACK,
-            2 * (job.pitch + SLACK),
-            deep_len(job),
-            job.tile[1].next_multiple_of(64),
-        ]
-        .map(|n| k * n)
-    }
-
-    fn bytes(job: &Job) -> usize {
-        let [planes, rows, work, deep, out] = Self::lens(job).map(padded::<T>);
-        2 * (planes + rows + out) + work + deep
-    }
-
-    fn cut(job: &Job, bytes: &mut &'a mut [u8]) -> Self {
-        let [planes, rows, work, deep, out] = Self::lens(job);
-        let mut of = |n| cut::<T>(bytes, n);
-        let (lo, hi, row_lo, row_hi) = (of(planes), of(planes), of(rows), of(rows));
-        let (work, deep) = (of(work), of(deep));
-        Extremes { lo, hi, row_lo, row_hi, work, deep, out_lo: of(out), out_hi: of(out) }
-    }
-
-    /// Nothing is neutral.
-    fn clear(&mut self) {
-        for (lo, hi) in [(&mut self.lo, &mut self.hi), (&mut self.row_lo, &mut self.row_hi)] {
-            lo.fill(T::GREATEST);
-            hi.fill(T::LEAST);
-        }
-    }
-
-    /// Moves rows that the tile above has made; rows that do not exist are neutral.
-    fn keep(&mut self, job: &Job, tile: &Tile, kept: usize) {
-        for plane in (0..self.lo.len()).step_by(job.narrow_plane()) {
-            let above = made_above(job, kept, plane);
-            self.lo.copy_within(above.clone(), plane);
-            self.hi.copy_within(above, plane);
-            for gap in empty_rows(job, tile, kept, plane) {
-                self.lo[gap.clone()].fill(T::GREATEST);
-                self.hi[gap].fill(T::LEAST);
-            }
-        }
-    }
-
-    /// Over z, buffer row `j` of all planes of a batch. NaN never wins a comparison, so it does not count.
-    fn planes(&mut self, level: Level, job: &Job, tile: &Tile, j: usize, lines: &Lines<T>) {
-        let plain = Coding { flip: T::default(), missing: T::default() };
-        let (masked, sources, blocks) = (Masked::<false>, Sources::<false>, (job.batch, job.block));
-        let (cols, out) = (tile.columns(), (j * job.narrow, job.narrow_plane()));
-        let clip = (lines.exist.0 as isize, lines.exist.1 as isize);
-        let from = lines::Lines { base: tile.cols.0 - first(tile), pitch: lines.pitch, first: 0, clip };
-        let (src, w) = ([&*lines.buffer; 2], job.window[0]);
-        blocked(level, blocks, masked, sources, src, from, w, cols, plain, self.lo, self.hi, out, self.deep);
-    }
-
-    /// Over y and x, row `j` of plane `k`; rows come in order.
-    fn row(&mut self, level: Level, job: &Job, tile: &Tile, k: usize, j: usize) {
-        if j.is_multiple_of(job.rows) {
-            let plane = k * job.narrow_plane()..(k + 1) * job.narrow_plane();
-            let from = [&self.lo[plane.clone()], &self.hi[plane]];
-            let lines = lines::Lines { base: 0, pitch: job.narrow, first: j as isize, clip: (0, job.height as isize) };
-            rows_extremes(level, job, tile, from, lines, self.row_lo, self.row_hi, self.deep);
-        }
-        let line = (j % job.rows) * job.pitch;
-        let (lo, hi) = (&self.row_lo[line..], &self.row_hi[line..]);
-        let pitches = Pitches { from: 0, to: 0, rows: 1 };
-        lines::row_extremes(level, lo, hi, job.window[2], job.tile[1], self.out_lo, self.out_hi, pitches, self.work);
     }
 }
 

@@ -20,6 +20,7 @@ mod finish;
 pub mod finish_floats;
 mod float;
 mod float_estimate;
+mod float_extremes;
 mod float_power;
 mod float_spread;
 mod int;
