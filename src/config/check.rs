@@ -42,7 +42,8 @@ impl Config {
         error.located(&self.file, line)
     }
 
-    fn line_of(&self, key: &str) -> Option<usize> {
+    /// The line of a key, as [`Config::locate`] finds it.
+    pub fn line_of(&self, key: &str) -> Option<usize> {
         let places = std::iter::once(&self.run.place)
             .chain(self.inputs.iter().map(|i| &i.place))
             .chain(self.stages.iter().map(|s| &s.place))

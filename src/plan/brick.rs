@@ -267,6 +267,33 @@ fn refuse(plan: &Plan, group: &Group, shape: Shape, which: &str, config: &Config
     ))
 }
 
+/// Bytes beside the budget that a chunk on its way may take: three quarters of what a run may have beyond `memory`.
+const BESIDE: u64 = 96 << 20;
+
+/// Refuses budgets that a chunk of an input breaks by itself: it is decoded whole, from as much again at worst.
+pub fn chunks_fit(plan: &Plan, config: &Config) -> Result<()> {
+    for wire in plan.graph.wires.iter() {
+        let Producer::Input(input) = wire.producer else { continue };
+        let Some(chunk) = plan.input_chunks[input] else { continue };
+        let voxels = chunk.iter().fold(1u64, |all, &n| all.saturating_mul(n as u64));
+        let bytes = voxels.saturating_mul(wire.dtype.size() as u64);
+        let need = bytes.saturating_mul(2).saturating_sub(BESIDE);
+        if need > plan.memory {
+            let (memory, took) = (mib(plan.memory), mib(bytes));
+            return Err(config.locate(Error::config(
+                "run.memory",
+                format!(
+                    "{memory} is too little for the chunks of input {}: one of {chunk:?} voxels (z, y, x) takes {took} decoded, and \
+                     up to as much encoded; give at least memory = \"{}MiB\"",
+                    config.inputs[input].name,
+                    need.div_ceil(1 << 20)
+                ),
+            )));
+        }
+    }
+    Ok(())
+}
+
 /// A size for people.
 pub fn mib(bytes: u64) -> String {
     if bytes >= 10 << 30 {

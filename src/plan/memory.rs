@@ -276,27 +276,25 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
         }
         let parts = output.spec.components.unwrap_or(1) as u64;
         let voxel = output.spec.dtype.size() as u64;
-        let task: u64 = (0..3).map(|a| group.task[a].min(group.region.shape()[a]) as u64).product();
+        let task: Shape = std::array::from_fn(|a| group.task[a].min(group.region.shape()[a]));
         for k in 0..=output.brick_level() {
             let factor = output.level(k).expect("level exists").factor;
             // Chunks are whole in memory where the volume ends inside them.
-            let chunks = (0..3).map(|a| {
-                let edge = group.task[a].min(group.region.shape()[a]).div_ceil(factor[a]);
-                edge.div_ceil(output.spec.chunk[a]) as u64
-            });
-            let chunks: u64 = chunks.product();
+            let along = |a: usize| task[a].div_ceil(factor[a]).div_ceil(output.spec.chunk[a]) as u64;
+            let chunks = (0..3).map(along).product::<u64>();
             // Along the Morton curve, at most the chunks along a brick's longest row wait at once, and about as many again.
             let chunk = output.spec.chunk.iter().map(|&n| n as u64).product::<u64>() * voxel * parts;
             let row = group.brick.shape[2].div_ceil(output.spec.chunk[2]) as u64;
             let whole = k == 0 && (0..3).all(|a| group.brick.shape[a].is_multiple_of(output.spec.chunk[a]));
             total += if whole { 0 } else { chunks.min(8 * row.max(1)) * chunk };
-            // One at a time each worker has one before and after its filters, and as it is compressed.
+            // Each worker encodes one at a time: as its filters leave it, and as it is compressed.
             encoding = encoding.max(chunks.min(plan.workers as u64) * (2 * chunk).saturating_sub(PER_THREAD));
         }
         // Cells kept for the second phase, where there is one.
         if output.level_count() > output.brick_level() + 1 {
             let deepest = output.level(output.brick_level()).expect("level exists").factor;
-            let cells = task / deepest.iter().map(|&f| f as u64).product::<u64>();
+            let cells =
+                task.iter().map(|&n| n as u64).product::<u64>() / deepest.iter().map(|&f| f as u64).product::<u64>();
             total += cells * parts * reduce::bytes_per_cell(output.reduce) as u64;
         }
     }

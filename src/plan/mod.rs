@@ -83,33 +83,6 @@ pub struct Plan {
     pub flows: Vec<FlowPlan>,
 }
 
-/// Bytes beside the budget that a chunk on its way may take: three quarters of what a run may have beyond `memory`.
-const BESIDE: u64 = 96 << 20;
-
-/// Refuses budgets that a chunk of an input breaks by itself: it is decoded whole, from as much again at worst.
-fn chunks_fit(plan: &Plan, config: &Config) -> Result<()> {
-    for wire in plan.graph.wires.iter() {
-        let graph::Producer::Input(input) = wire.producer else { continue };
-        let Some(chunk) = plan.input_chunks[input] else { continue };
-        let voxels = chunk.iter().fold(1u64, |all, &n| all.saturating_mul(n as u64));
-        let bytes = voxels.saturating_mul(wire.dtype.size() as u64);
-        let need = bytes.saturating_mul(2).saturating_sub(BESIDE);
-        if need > plan.memory {
-            let (memory, took) = (brick::mib(plan.memory), brick::mib(bytes));
-            return Err(config.locate(Error::config(
-                "run.memory",
-                format!(
-                    "{memory} is too little for the chunks of input {}: one of {chunk:?} voxels (z, y, x) takes {took} decoded, and \
-                     up to as much encoded; give at least memory = \"{}MiB\"",
-                    config.inputs[input].name,
-                    need.div_ceil(1 << 20)
-                ),
-            )));
-        }
-    }
-    Ok(())
-}
-
 impl Plan {
     /// Plans a run of `config` on volumes with these facts (the config's inputs, in order). Opens no file.
     /// `find_gpu` is called at most once, when a GPU could be used.
@@ -148,7 +121,7 @@ impl Plan {
         if plan.waives_byte_identity() {
             plan.warnings.push("lanes = \"mixed\": byte identity is waived for float stages on the GPU".into());
         }
-        chunks_fit(&plan, config)?;
+        brick::chunks_fit(&plan, config)?;
         streams::choose(&mut plan, config)?;
         fits::settle(&mut plan);
         Ok(plan)

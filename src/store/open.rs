@@ -18,9 +18,6 @@ pub fn open_inputs(config: &Config) -> Result<Vec<Source>> {
 fn said_of(config: &Config, name: &str, error: Error) -> Error {
     let Error::File { path, message } = error else { return config.locate(error) };
     let key = format!("input.{name}.path");
-    let Error::Config { file: Some(file), line, .. } = config.locate(Error::config(key.as_str(), "")) else {
-        return Error::File { path, message };
-    };
-    let line = line.map_or(String::new(), |line| format!(":{line}"));
-    Error::File { path, message: format!("{message} ({}{line}: {key})", file.display()) }
+    let line = config.line_of(&key).map_or(String::new(), |line| format!(":{line}"));
+    Error::File { path, message: format!("{message} ({}{line}: {key})", config.file.display()) }
 }

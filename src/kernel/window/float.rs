@@ -106,24 +106,29 @@ fn existing(tile: &Tile) -> usize {
 }
 
 crate::multiversion! {
-    /// Whether a row has a NaN or an infinity.
-    fn any_odd[T: Float](row: &[T]) -> bool = any_odd_inner;
+    /// Whether a row has NaN, and infinities.
+    fn odd_row[T: Float](row: &[T]) -> (bool, bool) = odd_inner;
 }
 
 #[inline(always)]
-fn any_odd_inner<T: Float>(row: &[T]) -> bool {
-    // The ends of the order are infinities.
-    !row.iter().fold(true, |all, v| all & (*v < T::GREATEST) & (*v > T::LEAST))
+#[allow(clippy::eq_op)]
+fn odd_inner<T: Float>(row: &[T]) -> (bool, bool) {
+    let (mut nan, mut infinite) = (false, false);
+    for v in row {
+        nan |= *v != *v;
+        // The ends of the order.
+        infinite |= (*v == T::GREATEST) | (*v == T::LEAST);
+    }
+    (nan, infinite)
 }
 
-/// Whether there are NaN, and infinities.
-fn odd_voxels<T: Float>(level: Level, src: View<T>) -> (bool, bool) {
-    let rows = (0..src.shape[0]).flat_map(|z| (0..src.shape[1]).map(move |y| src.row_at(z, y)));
+/// Whether there are NaN, and infinities, for which it looks no further than it must unless they `matter`.
+fn odd_voxels<T: Float>(level: Level, src: View<T>, matter: bool) -> (bool, bool) {
     let (mut nan, mut infinite) = (false, false);
-    for row in rows.filter(|row| any_odd(level, row)) {
-        nan |= row.iter().any(|v| v.to_f64().is_nan());
-        infinite |= row.iter().any(|v| v.to_f64().is_infinite());
-        if nan && infinite {
+    for (z, y) in (0..src.shape[0]).flat_map(|z| (0..src.shape[1]).map(move |y| (z, y))) {
+        let (n, i) = odd_row(level, src.row_at(z, y));
+        (nan, infinite) = (nan | n, infinite | i);
+        if nan && (infinite || !matter) {
             break;
         }
     }
@@ -143,10 +148,10 @@ pub fn run<T: Float>(
     let needs = Needs::of(outs.iter().map(|o| o.channel), true);
     let job = &Job::new(src.shape, dst, place, params, needs, plan::batch_bytes(T::DTYPE, needs));
     assert!(job.counts().0 < 1 << 31, "windows of {} voxels", job.counts().0);
-    let (counts, infinite) = odd_voxels(level, src);
-    // Openness by the spread asks them whether a window is constant, which the M2 of finite f32 says as well.
-    let asked = Needs::of(outs.iter().map(|o| o.channel), false).extremes;
-    let ends = needs.extremes && (asked || infinite || T::Total::PAIR);
+    // Openness by the spread asks extremes whether a window is constant, which the M2 of finite f32 says as well.
+    let asked = Needs::of(outs.iter().map(|o| o.channel), false).extremes || T::Total::PAIR;
+    let (counts, infinite) = odd_voxels(level, src, needs.extremes && !asked);
+    let ends = needs.extremes && (asked || infinite);
     let wanted = Wanted { pairs: T::Total::PAIR, variance: needs.variance, counts };
     let bytes = &mut &mut *bytes;
     let mut emit = Emit::new(outs, params, level, [job.tile[1]; 2], bytes);

@@ -175,7 +175,8 @@ fn other_order(meta: &ArrayMeta, multiscale: Option<&Multiscale>, lead: usize) -
 
 /// Spacing, origin and unit of the space axes.
 fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut VolumeInfo) -> Result<()> {
-    let mut first: Option<Option<String>> = None;
+    let unit = |a: usize| m.axes.get(a).and_then(|axis| axis.2.as_deref());
+    info.unit = unit(lead).map(str::to_string);
     for a in lead..n {
         let i = 3 - (n - a);
         info.spacing[i] = m.scale.get(a).copied().unwrap_or(1.0);
@@ -183,13 +184,10 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
         if info.shape[i] == 1 && info.spacing[i].partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
             info.spacing[i] = 1.0;
         }
-        let own = m.axes.get(a).and_then(|axis| axis.2.clone());
-        let unit = first.get_or_insert_with(|| own.clone());
-        let factor = units::to_one(unit.as_deref(), own.as_deref()).map_err(|why| Error::file(path, why))?;
+        let factor = units::to_one(unit(lead), unit(a)).map_err(|why| Error::file(path, why))?;
         info.spacing[i] *= factor;
         info.origin[i] *= factor;
     }
-    info.unit = first.flatten();
     Ok(())
 }
 
