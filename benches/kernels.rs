@@ -160,7 +160,7 @@ fn main() {
             if coded && dtype.result() != DType::F32 {
                 continue;
             }
-            for radius in [10, 64] {
+            for radius in [3, 10, 64] {
                 for level in Level::available().into_iter().rev() {
                     for data in ["phantom", "missing", "wide"] {
                         let tag = format!("{data}_r{radius}");

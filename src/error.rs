@@ -81,7 +81,7 @@ impl fmt::Display for Error {
             }
             Error::File { path, message } => write!(f, "{}: {message}", path.display()),
             Error::Failed(message) => f.write_str(message),
-            Error::Interrupted => f.write_str("interrupted; what was finished is kept, --resume continues"),
+            Error::Interrupted => f.write_str("interrupted; finished tasks are kept, --resume goes on with the rest"),
         }
     }
 }

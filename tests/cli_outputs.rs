@@ -107,13 +107,12 @@ fn components_are_compared_and_described_in_every_format() {
         let (code, _, err) = call(f, &["run", "c.toml", "-q", "--set", &format!("output.a.path={path}")]);
         assert_eq!(code, 0, "{err}");
         let (code, out, err) = call(f, &["info", &path]);
-        if format == "raw" {
-            let flags = ["--shape", "16,5,6", "--dtype", "f32"];
-            assert!(code == 2 && err.contains(&flags.join(" ")), "{code}: {err}");
-            assert_eq!(call(f, &[&["info", &path][..], &flags].concat()).0, 0);
-            continue;
-        }
         assert!(code == 0 && out.contains("4 x 5 x 6"), "{out}{err}");
+        if format == "raw" {
+            let (code, out, err) = call(f, &["info", &path, "--shape", "16,5,6", "--dtype", "f32"]);
+            assert!(code == 0 && out.contains("16 x 5 x 6"), "flags go first: {out}{err}");
+        }
+        assert_eq!(call(f, &["preview", &path, "p.png"]).0, 0);
         let (code, out, err) = call(f, &["compare", "a.zarr", &path, "--json"]);
         assert_eq!(code, 0, "{path}: {err}");
         let found: Value = serde_json::from_str(&out).unwrap();
@@ -149,4 +148,51 @@ fn a_limit_of_file_sizes_is_an_error_that_names_the_file() {
     assert!(!f.join("o.npy").exists());
     let (code, _, err) = call(f, &["run", "c.toml", "-q", "--resume"]);
     assert!(code == 0 && f.join("o.npy").exists(), "{err}");
+}
+
+/// A detached header is not its voxels: what it names is read, too.
+#[test]
+fn voxels_that_a_header_names_are_never_written_over() {
+    let folder = job("[output.o]\nfrom = \"g\"\npath = \"own.raw\"\n");
+    let f = folder.path();
+    let (code, _, err) = call(f, &["run", "c.toml", "-q"]);
+    assert_eq!(code, 0, "{err}");
+    let voxels = fs::read(f.join("own.raw")).unwrap();
+    let nrrd = "NRRD0004\ntype: float\ndimension: 3\nsizes: 6 5 4\nendian: little\nencoding: raw\ndata file: own.raw\n";
+    fs::write(f.join("own.nhdr"), nrrd).unwrap();
+    let meta = "NDims = 3\nDimSize = 6 5 4\nElementType = MET_FLOAT\nElementDataFile = own.raw\n";
+    fs::write(f.join("own.mhd"), meta).unwrap();
+    for header in ["own.nhdr", "own.mhd"] {
+        let input = format!("input.v.path={header}");
+        let refused = |args: &[&str], wants: &str| {
+            let (code, _, err) = call(f, &[args, &["--set", &input]].concat());
+            assert!(code == 2 && err.contains(wants) && err.contains("own.raw"), "{args:?} {header}: {code} {err}");
+            assert_eq!(fs::read(f.join("own.raw")).unwrap(), voxels);
+        };
+        refused(&["run", "c.toml", "--overwrite"], "c.toml:12: output.o.path");
+        refused(&["plan", "c.toml"], "c.toml:12: output.o.path");
+        let elsewhere = ["run", "c.toml", "--set", "output.o.path=p.raw"];
+        refused(&[&elsewhere[..], &["--report", "own.raw"]].concat(), "is read for an input");
+        refused(&[&elsewhere[..], &["--trace", "own.raw"]].concat(), "is read for an input");
+        assert!(!f.join("p.raw").exists());
+    }
+    // Nor files inside a folder that is read.
+    let (code, _, err) = call(f, &["run", "c.toml", "-q", "--set", "output.o.path=o.zarr"]);
+    assert_eq!(code, 0, "{err}");
+    let before = fs::read(f.join("o.zarr/zarr.json")).unwrap();
+    let (code, _, err) = call(f, &["preview", "o.zarr", "o.zarr/zarr.json"]);
+    assert!(code == 2 && err.contains("which is read"), "{code} {err}");
+    assert_eq!(fs::read(f.join("o.zarr/zarr.json")).unwrap(), before);
+}
+
+#[test]
+fn reports_that_cannot_be_written_are_refused_before_the_work() {
+    let folder = job("[output.o]\nfrom = \"g\"\npath = \"o.npy\"\n");
+    let f = folder.path();
+    let (code, _, err) = call(f, &["run", "c.toml", "--report", "r.json", "--trace", "./r.json"]);
+    assert!(code == 2 && err.contains("--trace") && err.contains("--report writes"), "{code} {err}");
+    // Whoever is root may write anywhere else.
+    let (code, _, err) = call(f, &["run", "c.toml", "--report", "/proc/r.json"]);
+    assert!(code == 1 && err.contains("/proc/r.json: cannot write"), "{code} {err}");
+    assert!(!f.join("o.npy").exists() && !f.join("r.json").exists());
 }

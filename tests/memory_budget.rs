@@ -300,6 +300,11 @@ fn large_chunks_count_in_the_budget() {
         assert!(peak <= (least + 128) * MIB, "peak {} MiB under {least} MiB", peak / MIB);
     };
     under("[input.v]\npath = 'v.npy'\n[output.o]\npath = 'o.zarr'\nfrom = 'v'\nchunk = 512\nshard = 'none'\n", 64);
+    // Indices of shards of two million chunks, most of which do not exist.
+    under(
+        "[input.v]\nsynthetic = 'noise'\nshape = [12, 13, 14]\ndtype = 'u8'\n[output.o]\npath = 'i.zarr'\nfrom = 'v'\nchunk = 2\n",
+        64,
+    );
     // Noise, so that packed chunks are as large as they can be.
     let made = "[input.v]\nsynthetic = 'noise'\nshape = [256, 256, 256]\ndtype = 'f32'\n[output.o]\npath = 'one.zarr'\nfrom = 'v'\n\
                 chunk = 256\nshard = 'none'\nlevels = 1\ndtype = 'f32'\n";

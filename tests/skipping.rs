@@ -225,3 +225,24 @@ fn flat_chunks_that_the_cache_cannot_hold_are_decoded_once_into_scratch() {
         assert_eq!(plan["scratch_bytes"], 0, "a large budget holds the stack of {chunk}");
     }
 }
+
+/// A pre-pass sees the whole volume, in bricks that fit it and not the region.
+#[test]
+fn a_small_region_does_not_make_a_prepass_dear() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [96, 96, 96];
+    write_npy(&dir.path().join("v.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+    let text = "run.region = [[40, 48], [40, 48], [40, 48]]\n[input.v]\npath = 'v.npy'\n[stage.s]\nop = 'box'\ninput = 'v'\nradius = 10\n\
+                [output.o]\npath = 'o.npy'\nfrom = 's.mean'\ndtype = 'u8'\nrange = 'auto'\n";
+    let report = run(dir.path(), text, &[]);
+    let file = 2 * 96u64.pow(3);
+    assert!(report.bytes_read < 3 * file, "{} bytes of a file of {file}", report.bytes_read);
+    let whole = run(dir.path(), text, &["run.region=all", "output.o.path=w.npy"]);
+    assert_eq!(whole.bricks.total, whole.bricks.computed);
+    let values = |name: &str| decode(&dir.path().join(name)).into_values().next().expect("a level").1;
+    let (part, all) = (values("o.npy"), values("w.npy"));
+    for (i, v) in part.iter().enumerate() {
+        let [z, y, x] = [i / 64, i / 8 % 8, i % 8].map(|c| 40 + c);
+        assert_eq!(*v, all[(z * 96 + y) * 96 + x], "{z} {y} {x}");
+    }
+}

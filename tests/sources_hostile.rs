@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use common_sources::*;
 use occlude::brick::Voxels;
-use occlude::config::{Input, Select};
+use occlude::config::{Input, RawFormat, Select};
 use occlude::grid::{DType, Region};
 use occlude::store::Source;
 
@@ -420,4 +420,26 @@ fn corrupt_chunks_are_named() {
     let mut chunk = Voxels::zeroed(DType::I16, 24);
     let e = Source::open(&file_input(&root)).unwrap().read_chunk(0, [0; 3], &mut chunk).unwrap_err().to_string();
     assert!(e.contains("more than the 48 bytes that the metadata say"), "{e}");
+}
+
+/// Nobody writes into these pipes: an open would wait for ever.
+#[test]
+fn pipes_are_no_volumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipe = folder.path().join("p.raw");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let header = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 3 2\nencoding: raw\ndata file: p.raw\n";
+    fs::write(folder.path().join("p.nhdr"), header).unwrap();
+    let raw = RawFormat {
+        shape: [2, 3, 4],
+        dtype: DType::U8,
+        big_endian: false,
+        offset: 0,
+        trailing_ignore: false,
+        components: 1,
+    };
+    for input in [raw_input(&pipe, raw), file_input(&folder.path().join("p.nhdr"))] {
+        let error = Source::open(&input).unwrap_err().to_string();
+        assert!(error.contains("p.raw") && error.contains("neither a file nor a folder"), "{error}");
+    }
 }

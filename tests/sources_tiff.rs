@@ -222,6 +222,18 @@ fn tiles_that_stick_out_of_the_page_are_read() {
 }
 
 #[test]
+fn hidden_files_are_no_slices() {
+    let folder = tempfile::tempdir().unwrap();
+    let page = Page { dtype: DType::U8, width: 5, height: 7, tile: [16, 16], compression: 5, predictor: 1, ..PAGE };
+    for name in ["a1.tif", "a2.tif", "a10.tif"] {
+        write(&page, &folder.path().join(name));
+    }
+    std::fs::write(folder.path().join("._a1.tif"), "what another system keeps beside a file").unwrap();
+    let source = occlude::store::Source::open(&file_input(folder.path())).unwrap();
+    assert_eq!(source.info().shape, [3, 7, 5]);
+}
+
+#[test]
 fn palettes_and_volumetric_tiles_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("odd.tif");

@@ -6,11 +6,12 @@ use serde_json::json;
 
 use super::args::CompareArgs;
 use super::moments::{Magnitudes, Moments};
+use super::progress::Shown;
 use super::reader::Volume;
 use super::{human, messages, usage};
 use crate::Result;
 use crate::kernel::ssim::Ssim;
-use crate::run::Cancel;
+use crate::run::{Cancel, Progress};
 
 /// How two volumes differ, over the voxels that both have.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,18 +29,26 @@ pub struct Difference {
     pub ssim: Option<f64>,
     /// Pairs that count: neither value is missing.
     pub n: u64,
+    /// Voxels that only the other volume has, of A and of B.
+    pub missing: [u64; 2],
 }
 
 /// Compares, prints, and fails beyond the bound.
-pub fn run(args: &CompareArgs) -> Result<ExitCode> {
+pub fn run(args: &CompareArgs, quiet: bool) -> Result<ExitCode> {
     let cancel = messages::interrupts();
     let a = Volume::open(&args.a, 0, &args.raw, &cancel)?;
     let b = Volume::open(&args.b, 0, &args.raw, &cancel)?;
-    let d = compare(&a, &b, &cancel)?;
+    let shown = Shown::patient(quiet);
+    let d = compare(&a, &b, &cancel, &shown);
+    shown.finish();
+    let d = d?;
     if args.json {
         messages::result_json(&d.json())?;
     } else {
         messages::result(&d.text())?;
+    }
+    if let Some(note) = d.unpaired() {
+        messages::note(&note);
     }
     match args.max_rmse {
         // Not a number is beyond every bound.
@@ -52,7 +61,7 @@ pub fn run(args: &CompareArgs) -> Result<ExitCode> {
 }
 
 /// Streams both volumes, plane by plane and component by component.
-pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
+pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel, progress: &dyn Progress) -> Result<Difference> {
     let (ia, ib) = (a.info(), b.info());
     if ia.shape != ib.shape {
         let message = format!(
@@ -71,8 +80,10 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
     let components = ia.components.max(1);
     let range = match a.attributes.is_openness() {
         true => 1.0,
-        false => value_range(a, components, cancel)?,
+        false => value_range(a, components, cancel, progress)?,
     };
+    let total = (components * ia.voxels()) as u64;
+    let mut done = 0;
     let mut sums = Sums::default();
     let mut plane = [0, 1].map(|_| vec![0.0; ia.shape[1] * ia.shape[2]]);
     for component in 0..components {
@@ -86,6 +97,8 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
             }
             sums.add(va, vb);
             similarity.push_plane(va, vb);
+            done += va.len() as u64;
+            progress.update(done, total, 0, 0, "compare");
         }
         sums.similar(similarity.finish());
     }
@@ -93,14 +106,18 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel) -> Result<Difference> {
 }
 
 /// Largest minus least finite value of all components; 1 of a constant, so that equal constants are alike.
-fn value_range(volume: &Volume, components: usize, cancel: &Cancel) -> Result<f64> {
+fn value_range(volume: &Volume, components: usize, cancel: &Cancel, progress: &dyn Progress) -> Result<f64> {
     let mut all = Moments::default();
+    let total = (components * volume.info().voxels()) as u64;
+    let mut done = 0;
     for component in 0..components {
         let mut planes = volume.planes(component)?;
         let mut plane = vec![0.0; planes.plane_voxels()];
         while planes.next(&mut plane)? {
             cancel.check()?;
             all = all.merge(Moments::of(&plane));
+            done += plane.len() as u64;
+            progress.update(done, total, 0, 0, "range of A");
         }
     }
     let range = all.max - all.min;
@@ -118,6 +135,7 @@ pub struct Sums {
     magnitudes: Magnitudes,
     /// Sum of window values and how many there are.
     similarity: (f64, u64),
+    missing: [u64; 2],
 }
 
 impl Sums {
@@ -136,6 +154,10 @@ impl Sums {
         self.absolute += absolute;
         self.squares += squares;
         self.signed = self.signed.merge(Moments::of(&difference));
+        for (a, b) in a.iter().zip(b) {
+            self.missing[0] += u64::from(a.is_nan() && !b.is_nan());
+            self.missing[1] += u64::from(b.is_nan() && !a.is_nan());
+        }
     }
 
     /// Takes in a mean similarity and its number of windows.
@@ -157,16 +179,23 @@ impl Sums {
             p99: self.magnitudes.quantile(0.99),
             ssim: (self.similarity.1 > 0).then(|| self.similarity.0 / self.similarity.1 as f64),
             n,
+            missing: self.missing,
         }
     }
 }
 
 impl Difference {
+    /// What no number above tells, where a volume lacks voxels that the other one has.
+    fn unpaired(&self) -> Option<String> {
+        let [a, b] = self.missing;
+        (a + b > 0).then(|| format!("{a} voxels are missing in A alone and {b} in B alone; no number counts them"))
+    }
+
     /// Numbers by name; what is not finite becomes null.
     pub fn json(&self) -> serde_json::Value {
         json!({
             "rmse": self.rmse, "mae": self.mae, "bias": self.bias, "max_abs": self.max_abs, "p99": self.p99,
-            "ssim": self.ssim, "n": self.n,
+            "ssim": self.ssim, "n": self.n, "missing_a": self.missing[0], "missing_b": self.missing[1],
         })
     }
 
@@ -200,8 +229,11 @@ mod tests {
         assert!((d.mae - 4.0 / 3.0).abs() < 1e-15);
         assert!((d.bias + 2.0 / 3.0).abs() < 1e-15);
         assert_eq!((d.max_abs, d.p99, d.ssim), (3.0, 3.0, Some(0.75)));
+        assert_eq!(d.missing, [2, 1]);
+        assert_eq!((d.json()["missing_a"].as_u64(), d.json()["missing_b"].as_u64()), (Some(2), Some(1)));
+        assert!(d.unpaired().unwrap().starts_with("2 voxels are missing in A alone and 1 in B"));
         let nothing = Sums::default().finish();
-        assert!(nothing.rmse.is_nan() && nothing.ssim.is_none() && nothing.n == 0);
+        assert!(nothing.rmse.is_nan() && nothing.ssim.is_none() && nothing.n == 0 && nothing.unpaired().is_none());
     }
 
     #[test]

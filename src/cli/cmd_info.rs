@@ -7,19 +7,20 @@ use serde_json::{Value, json};
 use super::args::InfoArgs;
 use super::attributes::{self, Attributes};
 use super::moments::{Histogram, Moments};
+use super::progress::Shown;
 use super::reader::{self, Volume};
 use super::{human, messages};
 use crate::Result;
-use crate::run::Cancel;
+use crate::run::{Cancel, Progress};
 use crate::store::{Source, VolumeInfo};
 
 const BINS: usize = 64;
 
 /// Prints what a volume is.
-pub fn run(args: &InfoArgs) -> Result<()> {
+pub fn run(args: &InfoArgs, quiet: bool) -> Result<()> {
     let attributes = attributes::read(&args.path);
     let cancel = messages::interrupts();
-    let statistics = if args.stats { Some(statistics(args, &cancel)?) } else { None };
+    let statistics = if args.stats { Some(statistics(args, &cancel, quiet)?) } else { None };
     let info = match &statistics {
         Some((info, _)) if args.level == 0 => info.clone(),
         _ => Source::open(&reader::described(&args.path, 0, &args.raw, &attributes)?)?.info().clone(),
@@ -51,17 +52,15 @@ fn warnings(info: &VolumeInfo, attributes: &Attributes) -> Vec<String> {
     if info.unit.is_none() {
         found.push("no unit of length is known: physical lengths need `unit` in the config".to_string());
     }
-    let least = info.spacing.iter().copied().fold(f64::INFINITY, f64::min);
-    let most = info.spacing.iter().copied().fold(0.0, f64::max);
+    let long = || (0..3).filter(|&a| info.shape[a] > 1).map(|a| info.spacing[a]);
+    let (least, most) = (long().fold(f64::INFINITY, f64::min), long().fold(0.0, f64::max));
     if most > 3.0 * least {
         found.push(format!(
             "spacing differs by {} between axes: a window of one radius in voxels is that much longer on one axis; a physical radius evens it out",
             human::number(most / least)
         ));
     }
-    let oblique =
-        |m: &[[f64; 4]; 3]| (0..3).any(|r| (0..3).any(|c| if r == c { m[r][c] <= 0.0 } else { m[r][c] != 0.0 }));
-    if info.orientation.as_ref().is_some_and(|o| oblique(&o.matrix)) {
+    if info.orientation.as_ref().is_some_and(|o| o.straight_origin().is_none()) {
         found.push(
             "the direction matrix is not diagonal and positive: origin 0 is used, and the matrix is kept as orientation".into(),
         );
@@ -75,14 +74,16 @@ struct Statistics {
     histogram: Histogram,
 }
 
-fn statistics(args: &InfoArgs, cancel: &Cancel) -> Result<(VolumeInfo, Vec<Statistics>)> {
+fn statistics(args: &InfoArgs, cancel: &Cancel, quiet: bool) -> Result<(VolumeInfo, Vec<Statistics>)> {
     let volume = Volume::open(&args.path, args.level, &args.raw, cancel)?;
     let components = volume.info().components.max(1);
-    let each = (0..components).map(|c| of_component(&volume, c, cancel)).collect::<Result<_>>()?;
-    Ok((volume.info().clone(), each))
+    let shown = Shown::patient(quiet);
+    let each = (0..components).map(|c| of_component(&volume, c, cancel, &shown)).collect::<Result<_>>();
+    shown.finish();
+    Ok((volume.info().clone(), each?))
 }
 
-fn of_component(volume: &Volume, component: usize, cancel: &Cancel) -> Result<Statistics> {
+fn of_component(volume: &Volume, component: usize, cancel: &Cancel, progress: &dyn Progress) -> Result<Statistics> {
     // Types of few values: one pass with a bin per value, joined afterwards. Others: the range first.
     let (lo, hi) = volume.info().dtype.range();
     let fine = (volume.info().dtype.size() <= 2).then(|| {
@@ -93,7 +94,7 @@ fn of_component(volume: &Volume, component: usize, cancel: &Cancel) -> Result<St
     });
     let mut fine = fine;
     let mut moments = Moments::default();
-    pass(volume, component, cancel, &mut |plane| {
+    pass(volume, component, cancel, progress, &mut |plane| {
         moments = moments.merge(Moments::of(plane));
         if let Some(fine) = &mut fine {
             fine.add(plane);
@@ -110,17 +111,26 @@ fn of_component(volume: &Volume, component: usize, cancel: &Cancel) -> Result<St
                 histogram.add_times(centre, *count);
             }
         }
-        None => pass(volume, component, cancel, &mut |plane| histogram.add(plane))?,
+        None => pass(volume, component, cancel, progress, &mut |plane| histogram.add(plane))?,
     }
     Ok(Statistics { moments, histogram })
 }
 
-fn pass(volume: &Volume, component: usize, cancel: &Cancel, f: &mut dyn FnMut(&[f64])) -> Result<()> {
+fn pass(
+    volume: &Volume,
+    component: usize,
+    cancel: &Cancel,
+    progress: &dyn Progress,
+    f: &mut dyn FnMut(&[f64]),
+) -> Result<()> {
     let mut planes = volume.planes(component)?;
     let mut plane = vec![0.0; planes.plane_voxels()];
+    let mut done = 0;
     while planes.next(&mut plane)? {
         cancel.check()?;
         f(&plane);
+        done += plane.len() as u64;
+        progress.update(done, volume.info().voxels() as u64, 0, 0, "statistics");
     }
     Ok(())
 }

@@ -2,7 +2,7 @@
 
 use super::args::RunArgs;
 use super::progress::Shown;
-use super::{human, load, messages, refuse_overwriting, usage, write_whole};
+use super::{can_write, human, load, messages, refuse_overwriting, usage, write_whole};
 use crate::config::InputKind;
 use crate::config::check::resolved;
 use crate::run::{self, Report, RunOptions};
@@ -28,12 +28,19 @@ pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
             let message = format!("got {}, which output {:?} writes; expected another file", path.display(), o.name);
             return Err(usage(flag, message));
         }
+        can_write(path)?;
+    }
+    if let (Some(report), Some(trace)) = (&args.report, &args.trace)
+        && resolved(report) == resolved(trace)
+    {
+        return Err(usage("--trace", format!("got {}, which --report writes; expected another file", trace.display())));
     }
     let options = RunOptions {
         resume: args.resume,
         overwrite: args.overwrite,
         no_skip: args.no_skip,
         trace: args.trace.clone(),
+        report: args.report.clone(),
         cancel: messages::interrupts(),
     };
     let progress = Shown::new(quiet);

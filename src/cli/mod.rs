@@ -16,11 +16,12 @@ pub mod plot;
 pub mod progress;
 pub mod reader;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
 
+use crate::config::check::resolved;
 use crate::config::{self, Config, Device};
 use crate::{Error, Result};
 use args::{Cli, Command, ConfigArgs, DeviceArg};
@@ -54,8 +55,8 @@ fn command(cli: &Cli) -> Result<ExitCode> {
     match &cli.command {
         Command::Run(args) => cmd_run::run(args, cli.quiet)?,
         Command::Plan(args) => cmd_plan::run(args)?,
-        Command::Info(args) => cmd_info::run(args)?,
-        Command::Compare(args) => return cmd_compare::run(args),
+        Command::Info(args) => cmd_info::run(args, cli.quiet)?,
+        Command::Compare(args) => return cmd_compare::run(args, cli.quiet),
         Command::Preview(args) => cmd_preview::run(args)?,
         Command::Pareto(args) => pareto::run(args, cli.quiet)?,
         Command::Schema => messages::result_json(&config::schema())?,
@@ -101,20 +102,33 @@ fn usage(flag: &str, message: impl std::fmt::Display) -> Error {
     Error::config(flag, message)
 }
 
-/// Refuses to write a result over a file that is read.
+/// Refuses to write a result over a file that is read, or into a folder that is.
 fn refuse_overwriting<'a>(flag: &str, out: &Path, read: impl IntoIterator<Item = &'a Path>) -> Result<()> {
-    let same = |p: &Path| out == p || matches!((out.canonicalize(), p.canonicalize()), (Ok(a), Ok(b)) if a == b);
-    match read.into_iter().find(|p| same(p)) {
+    let real = resolved(out);
+    match read.into_iter().find(|p| real.starts_with(resolved(p))) {
         Some(_) => Err(usage(flag, format!("got {}, which is read; expected another file", out.display()))),
         None => Ok(()),
     }
 }
 
-/// Writes a file under a temporary name first, so that no reader sees half of it.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+/// The name under which [`write_whole`] writes first.
+fn temporary(path: &Path) -> Result<PathBuf> {
     let mut name = path.file_name().ok_or_else(|| Error::file(path, "is not a file name"))?.to_os_string();
     name.push(format!(".{}.tmp", std::process::id()));
-    let temporary = path.with_file_name(name);
+    Ok(path.with_file_name(name))
+}
+
+/// Whether a file can be made there, which is better known before hours of work than after.
+fn can_write(path: &Path) -> Result<()> {
+    let temporary = temporary(path)?;
+    let made = std::fs::File::create(&temporary);
+    let _ = std::fs::remove_file(&temporary);
+    made.map(drop).map_err(|e| Error::file(path, format!("cannot write: {e}")))
+}
+
+/// Writes a file under a temporary name first, so that no reader sees half of it.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    let temporary = temporary(path)?;
     std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, path)).map_err(|e| {
         let _ = std::fs::remove_file(&temporary);
         Error::file(path, format!("cannot write: {e}"))

@@ -44,6 +44,13 @@ impl Shown {
         Shown { style, start: Instant::now(), state: Mutex::default() }
     }
 
+    /// As [`Shown::new`], of work that is mostly done in a moment: the first plain line comes after some seconds.
+    pub fn patient(quiet: bool) -> Shown {
+        let shown = Shown::new(quiet);
+        shown.state.lock().unwrap_or_else(|e| e.into_inner()).last_line = Some(Instant::now());
+        shown
+    }
+
     /// Takes the bar away.
     pub fn finish(&self) {
         if let Style::Bar(bar) = &self.style {
@@ -83,12 +90,13 @@ impl Progress for Shown {
         let (since, at_start) = state.phase_start.unwrap_or((self.start, 0));
         let fresh = done.saturating_sub(at_start);
         let pace = pace(fresh, total.saturating_sub(at_start), now.duration_since(since).as_secs_f64());
+        let counted = if bricks_total == 0 { String::new() } else { format!("{bricks}/{bricks_total} bricks, ") };
         match &self.style {
             Style::Quiet => {}
             Style::Bar(bar) => {
                 bar.set_length(total);
                 bar.set_prefix(phase.to_string());
-                bar.set_message(format!("{bricks}/{bricks_total} bricks, {pace}"));
+                bar.set_message(format!("{counted}{pace}"));
                 bar.set_position(done.min(total));
             }
             Style::Lines => {
@@ -100,7 +108,7 @@ impl Progress for Shown {
                 }
                 state.last_line = Some(now);
                 let percent = if total == 0 { 100.0 } else { 100.0 * done as f64 / total as f64 };
-                let _ = writeln!(std::io::stderr(), "{phase}: {percent:.1} %, {bricks}/{bricks_total} bricks, {pace}");
+                let _ = writeln!(std::io::stderr(), "{phase}: {percent:.1} %, {counted}{pace}");
             }
         }
     }

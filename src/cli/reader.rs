@@ -56,7 +56,8 @@ impl Drop for Scratch {
 fn input(path: &Path, level: usize, raw: &RawArgs) -> Result<Input> {
     let headerless = match (raw.shape, raw.dtype) {
         (Some(shape), Some(dtype)) => {
-            Some(RawFormat { shape, dtype, big_endian: raw.big_endian, offset: raw.offset, trailing_ignore: false })
+            let (big_endian, offset) = (raw.big_endian, raw.offset);
+            Some(RawFormat { shape, dtype, big_endian, offset, trailing_ignore: false, components: 1 })
         }
         (None, None) => None,
         _ => return Err(usage("--shape", "a headerless volume needs both --shape and --dtype")),
@@ -143,25 +144,21 @@ impl Volume {
 
 /// [`input`] of a path with what is known beside it.
 pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attributes) -> Result<Input> {
+    let own = raw.shape.is_none();
     let raw = describe(path, raw, attributes);
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     let stem = name.strip_suffix(".gz").unwrap_or(&name);
     if raw.shape.is_none() && path.is_file() && (stem.ends_with(".raw") || stem.ends_with(".bin")) {
-        let message = match (attributes.components, attributes.shape, attributes.dtype) {
-            // One after the other, which is a volume of as many planes.
-            (Some(c), Some([z, y, x]), Some(dtype)) => format!(
-                "{} holds {c} components of {z} x {y} x {x} voxels, one after the other; expected --shape {},{y},{x} --dtype {dtype}",
-                path.display(),
-                c * z
-            ),
-            _ => format!("{} is headerless; expected --shape Z,Y,X and --dtype beside it", path.display()),
-        };
+        let message = format!("{} is headerless; expected --shape Z,Y,X and --dtype beside it", path.display());
         return Err(usage("--shape", message));
     }
     let mut input = input(path, level, &raw)?;
     if attributes.components.is_some() {
         // NIfTI keeps the components of an output as times.
         input.time = Select::All;
+    }
+    if let (InputKind::Path { raw: Some(raw), .. }, true) = (&mut input.kind, own) {
+        raw.components = attributes.components.unwrap_or(1);
     }
     Ok(input)
 }
@@ -170,7 +167,7 @@ pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attribut
 fn describe(path: &Path, given: &RawArgs, attributes: &Attributes) -> RawArgs {
     let raw_name = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("raw"));
     match (attributes.shape, given.dtype.or(attributes.dtype)) {
-        (Some(shape), Some(dtype)) if raw_name && given.shape.is_none() && attributes.components.is_none() => {
+        (Some(shape), Some(dtype)) if raw_name && given.shape.is_none() => {
             RawArgs { shape: Some(shape), dtype: Some(dtype), ..given.clone() }
         }
         _ => given.clone(),

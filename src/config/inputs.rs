@@ -92,6 +92,7 @@ fn file(r: &Reader, base: &Path) -> Result<InputKind> {
         big_endian: r.choice("endian", &[("little", false), ("big", true), ("native", big)])?,
         offset: r.int("offset")? as u64,
         trailing_ignore: r.choice("trailing", &[("refuse", false), ("ignore", true)])?,
+        components: 1,
     };
     Ok(InputKind::Path { path, raw: Some(raw) })
 }

@@ -117,6 +117,8 @@ pub struct RawFormat {
     pub offset: u64,
     /// Bytes after the last voxel are allowed (`trailing = "ignore"`).
     pub trailing_ignore: bool,
+    /// Volumes of this shape, one after the other.
+    pub components: usize,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -52,6 +52,17 @@ pub fn to_metres(unit: &str) -> Option<f64> {
     entry(unit).map(|u| u.1)
 }
 
+/// A length in one unit as a number of another: decimal factors are whole numbers, by which 2.5 and 1050 come out as on paper.
+pub fn converted(value: f64, from: &str, to: &str) -> Option<f64> {
+    let (from, to) = (to_metres(from)?, to_metres(to)?);
+    let whole = |ratio: f64| Some(ratio.round()).filter(|r| *r >= 1.0 && (ratio / r - 1.0).abs() < 1e-12);
+    Some(match (whole(from / to), whole(to / from)) {
+        (Some(times), _) => value * times,
+        (None, Some(parts)) => value / parts,
+        (None, None) => value * (from / to),
+    })
+}
+
 /// The UDUNITS name of a unit (`"mm"`, `"µm"`, `"inches"` to `millimeter`, `micrometer`, `inch`).
 pub fn udunits_name(text: &str) -> Option<&'static str> {
     entry(text).map(|u| u.0)
@@ -86,6 +97,24 @@ mod tests {
         for bad in ["", "furlong", "pixel", "s", "mmm", "M"] {
             assert_eq!(udunits_name(bad), None, "{bad}");
         }
+    }
+
+    #[test]
+    fn decimal_factors_are_exact() {
+        for (value, from, to, want) in [
+            (2.5, "um", "nm", 2500.0),
+            (1050.0, "um", "mm", 1.05),
+            (525.0, "um", "mm", 0.525),
+            (1.5, "inch", "mm", 38.1),
+            (7.0, "m", "m", 7.0),
+            (3.0, "angstrom", "nm", 0.3),
+        ] {
+            let got = converted(value, from, to).unwrap();
+            assert!((got / want - 1.0).abs() < 1e-15 || got == want, "{value} {from}: {got}");
+        }
+        assert_eq!(converted(2.5, "um", "nm"), Some(2500.0));
+        assert_eq!(converted(1050.0, "um", "mm"), Some(1.05));
+        assert_eq!(converted(1.0, "furlong", "mm"), None);
     }
 
     #[test]

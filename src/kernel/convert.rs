@@ -29,6 +29,19 @@ pub fn convert(src: AnyView, mapping: Mapping, dst: AnyViewMut) {
 pub fn convert_at(level: Level, src: AnyView, mapping: Mapping, mut dst: AnyViewMut) {
     assert_eq!(src.shape(), dst.shape(), "conversion keeps the shape");
     let [nz, ny, _] = src.shape();
+    let rows = || (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y)));
+    if let (AnyView::F32(s), true) = (src, level > Level::Baseline && mapping.range == Some([0.0, 1.0])) {
+        let fill = Linear::new(mapping, dst.dtype()).fill;
+        match &mut dst {
+            AnyViewMut::U8(d) => {
+                return rows().for_each(|(z, y)| unit(level, s.row_at(z, y), 255.0, fill, d.row_at(z, y)));
+            }
+            AnyViewMut::U16(d) => {
+                return rows().for_each(|(z, y)| unit(level, s.row_at(z, y), 65535.0, fill, d.row_at(z, y)));
+            }
+            _ => {}
+        }
+    }
     with_view!(AnyView, src, s => with_view!(AnyViewMut, &mut dst, d => {
         for z in 0..nz {
             for y in 0..ny {
@@ -128,6 +141,22 @@ fn quantise_loop<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
     }
 }
 
+/// 2^23: a fused product and this sum round once, ties to even, and leave the integer in the low bits. So single floats of openness
+/// need no f64 on the way.
+const ROUNDER_SINGLE: f32 = 8_388_608.0;
+
+#[inline(always)]
+fn unit_inner<D: Output>(src: &[f32], top: f32, fill: f64, dst: &mut [D]) {
+    let fill = (fill + ROUNDER).to_bits() as u32;
+    for (d, s) in dst.iter_mut().zip(src) {
+        // NaN becomes 0 here.
+        let v = if *s > 0.0 { *s } else { 0.0 };
+        let v = if v < 1.0 { v } else { 1.0 };
+        let code = v.mul_add(top, ROUNDER_SINGLE).to_bits();
+        *d = D::from_low_bits(if s.is_nan() { fill } else { code } as u64);
+    }
+}
+
 #[inline(always)]
 fn cast_inner<S: Voxel, D: Output>(src: &[S], dst: &mut [D]) {
     for (d, s) in dst.iter_mut().zip(src) {
@@ -137,6 +166,10 @@ fn cast_inner<S: Voxel, D: Output>(src: &[S], dst: &mut [D]) {
 
 crate::multiversion! {
     fn quantise[S: Voxel, D: Output](src: &[S], map: Linear, dst: &mut [D]) -> () = quantise_inner;
+}
+crate::multiversion! {
+    /// [`quantise`] of [0, 1] to integers of up to 16 bits, of which `top` is the largest. Without fused operations it is the slower one.
+    fn unit[D: Output](src: &[f32], top: f32, fill: f64, dst: &mut [D]) -> () = unit_inner;
 }
 crate::multiversion! {
     fn cast[S: Voxel, D: Output](src: &[S], dst: &mut [D]) -> () = cast_inner;

@@ -41,6 +41,18 @@ impl Level {
     }
 }
 
+/// Asks for the cache lines of a row that is read or written soon, and that the CPU cannot foresee.
+#[inline(always)]
+pub fn fetch<T>(row: &[T]) {
+    #[cfg(target_arch = "x86_64")]
+    for line in row.chunks((64 / size_of::<T>()).max(1)) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a hint, which touches nothing, and every x86-64 has it.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
+    }
+    let _ = row;
+}
+
 /// Makes `fn name(level, args..)`, which runs the `#[inline(always)]` function `inner(args..)` compiled for that level:
 /// `multiversion! { pub fn name['a, T: Voxel](src: &'a [T], dst: &mut [T]) -> () = inner; }` (the brackets hold the
 /// generics and may be empty). The caller promises that the CPU has the level, which [`Level::detect`] and

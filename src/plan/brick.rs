@@ -3,8 +3,8 @@
 use super::Plan;
 use super::graph::Producer;
 use super::memory::{self, brick_bytes, parked_bytes};
-use super::streams;
 use super::tasks::{Group, input_halo};
+use super::{streams, tasks};
 use crate::config::Config;
 use crate::grid::Shape;
 use crate::{Error, Result};
@@ -84,6 +84,11 @@ pub fn choose(plan: &Plan, group: &Group, config: &Config) -> Result<(BrickChoic
         }
         None => Err(refuse(plan, group, least(plan, group), "the smallest", config)),
     }
+}
+
+/// Bricks of a pre-pass: those of a run of the whole volume, since a small region has small ones, which are mostly halo.
+pub fn over_all(plan: &Plan, group: &Group, config: &Config) -> BrickChoice {
+    choose(plan, &tasks::over_all(plan, group), config).map_or_else(|_| group.brick.clone(), |(choice, _)| choice)
 }
 
 /// The brick of those that are looked at which takes least memory.

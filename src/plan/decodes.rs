@@ -17,6 +17,9 @@ const MOST_DECODES: f64 = 3.0;
 /// Visits of chunks that are played through, some tens of milliseconds and 20 MiB: what comes later goes as what came before.
 const MOST_VISITS: usize = 1 << 18;
 
+/// Tasks along an axis that are looked at, a power of two.
+const MOST_TASKS: usize = 64;
+
 /// Times that a sweep which reads while it runs is taken to go through all that it sees: one for some of its directions.
 const SWEEP_PASSES: usize = 8;
 
@@ -84,9 +87,12 @@ fn visits(group: &Group, inputs: &[Chunked]) -> (Vec<u32>, Vec<usize>) {
     let whole = Region::whole(group.shape);
     let (mut numbers, mut of, mut visits) = (HashMap::new(), Vec::new(), Vec::new());
     let [_, ny, nx] = group.tasks;
-    let mut tasks: Vec<usize> = (0..group.task_count()).collect();
-    tasks.sort_by_key(|&t| morton([t / (ny * nx), t / nx % ny, t % nx].map(|v| v as i64)));
-    for brick in tasks.into_iter().flat_map(|t| group.bricks(group.task_region(t))) {
+    // The first along the curve, whatever the volume's size.
+    let first = Region::whole(group.tasks.map(|n| n.min(MOST_TASKS)));
+    let mut tasks: Vec<[i64; 3]> = first.iter().collect();
+    tasks.sort_by_key(|t| morton(*t));
+    let number = |[z, y, x]: [i64; 3]| (z as usize * ny + y as usize) * nx + x as usize;
+    for brick in tasks.into_iter().map(number).flat_map(|t| group.bricks(group.task_region(t))) {
         for (i, input) in inputs.iter().enumerate() {
             let cells = brick.grow(input.halo).clip(&whole).cells([0; 3], input.chunk);
             for _ in 0..input.passes {

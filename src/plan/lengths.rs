@@ -4,10 +4,17 @@ use super::graph::Lattice;
 use crate::config::{Length, units};
 use crate::{Error, Result};
 
-/// Metres per unit of a lattice; an error says how to give the unit.
-fn lattice_unit(lattice: &Lattice, key: &str, given: &str) -> Result<f64> {
-    lattice.unit.as_deref().and_then(units::to_metres).ok_or_else(|| {
-        let has = lattice.unit.as_deref().unwrap_or("none");
+/// A physical length in units of the lattice's spacing; errors say what unit is not known, and how to give it.
+fn physical(value: f64, unit: &str, lattice: &Lattice, key: &str) -> Result<f64> {
+    let given = format!("{value} {unit}");
+    if units::to_metres(unit).is_none() {
+        let message =
+            format!("\"{given}\" has an unknown unit; accepted: m, cm, mm, um, nm, angstrom and UDUNITS names");
+        return Err(Error::config(key, message));
+    }
+    let own = lattice.unit.as_deref();
+    own.and_then(|own| units::converted(value, unit, own)).ok_or_else(|| {
+        let has = own.unwrap_or("none");
         Error::config(
             key,
             format!(
@@ -18,16 +25,9 @@ fn lattice_unit(lattice: &Lattice, key: &str, given: &str) -> Result<f64> {
     })
 }
 
-/// A physical length in units of the lattice's spacing.
-fn physical(value: f64, unit: &str, lattice: &Lattice, key: &str) -> Result<f64> {
-    let given = format!("{value} {unit}");
-    let metres = units::to_metres(unit).ok_or_else(|| {
-        Error::config(
-            key,
-            format!("\"{given}\" has an unknown unit; accepted: m, cm, mm, um, nm, angstrom and UDUNITS names"),
-        )
-    })?;
-    Ok(value * metres / lattice_unit(lattice, key, &given)?)
+/// Rounds half away from zero a positive quotient of decimal numbers, of which binary ones may fall short of a half by a few ulps.
+fn round_half_away(voxels: f64) -> f64 {
+    (voxels * (1.0 + 1e-9)).round()
 }
 
 /// Half-widths in voxels. Physical: `round(R / spacing)` half away from zero, at least 1 on an axis longer than 1.
@@ -37,7 +37,7 @@ pub fn radius(length: &Length, lattice: &Lattice, key: &str) -> Result<[usize; 3
         Length::Physical { value, unit } => {
             let r = physical(*value, unit, lattice, key)?;
             Ok(std::array::from_fn(|a| {
-                let voxels = (r / lattice.spacing[a]).round();
+                let voxels = round_half_away(r / lattice.spacing[a]);
                 (voxels.min(1e9) as usize).max(usize::from(lattice.shape[a] > 1))
             }))
         }
@@ -96,6 +96,21 @@ mod tests {
         assert_eq!(radius(&r, &lattice([1.0, 10.0, 10.0], Some("millimeter")), "k").unwrap(), [3, 1, 0]);
         assert_eq!(radius(&r, &lattice([1000.0, 500.0, 1.0], Some("micrometer")), "k").unwrap(), [3, 5, 2500]);
         assert!(radius(&r, &lattice([1.0; 3], None), "k").is_err());
+    }
+
+    #[test]
+    fn one_length_in_two_units_is_one_radius() {
+        for (value, spacing, want) in
+            [(1.05, 0.3, 4), (1.05, 0.7, 2), (0.525, 0.35, 2), (0.15, 0.1, 2), (0.3, 0.2, 2), (0.29, 0.2, 1)]
+        {
+            let lattice = lattice([spacing, 1.0, 1.0], Some("millimeter"));
+            for (factor, unit) in [(1.0, "mm"), (1e3, "um"), (1e6, "nm")] {
+                let r = Length::Physical { value: f64::round(value * factor * 1e6) / 1e6, unit: unit.into() };
+                assert_eq!(radius(&r, &lattice, "k").unwrap()[0], want, "{value} mm in {unit}, {spacing} mm");
+            }
+        }
+        let inch = Length::Physical { value: 1.5, unit: "inch".into() };
+        assert_eq!(radius(&inch, &lattice([25.4, 1.0, 1.0], Some("millimeter")), "k").unwrap()[0], 2);
     }
 
     #[test]

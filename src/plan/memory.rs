@@ -290,6 +290,7 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
             // Each worker encodes one at a time: as its filters leave it, and as it is compressed.
             encoding = encoding.max(chunks.min(plan.workers as u64) * (2 * chunk).saturating_sub(PER_THREAD));
         }
+        total += index_bytes(output, task);
         // Cells kept for the second phase, where there is one.
         if output.level_count() > output.brick_level() + 1 {
             let deepest = output.level(output.brick_level()).expect("level exists").factor;
@@ -299,6 +300,20 @@ pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
         }
     }
     total + encoding
+}
+
+/// Indices of the shards of all levels of a task, and one of them once more while it is written.
+fn index_bytes(output: &OutputPlan, task: Shape) -> u64 {
+    if !output.spec.is_sharded() {
+        return 0;
+    }
+    let (file, chunk) = (output.spec.file_shape(), output.spec.chunk);
+    let entries = (0..3).map(|a| (file[a] / chunk[a]) as u64).product::<u64>();
+    let shards = (0..output.level_count())
+        .filter_map(|k| output.level(k))
+        .map(|level| (0..3).map(|a| task[a].div_ceil(level.factor[a]).div_ceil(file[a]) as u64).product::<u64>());
+    let open = shards.sum::<u64>() * output.spec.components.unwrap_or(1) as u64;
+    (open + 1).saturating_mul(16 * entries)
 }
 
 /// Bricks that are alive at once: one per worker, one being read, one being written.

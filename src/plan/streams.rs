@@ -45,6 +45,7 @@ pub fn choose(plan: &mut Plan, config: &Config) -> Result<()> {
 /// Groups and bricks of the graph as it is, and the relative time of the whole run.
 fn bricks(plan: &mut Plan, config: &Config) -> Result<f64> {
     plan.groups = tasks::groups(plan);
+    tasks::countable(plan).map_err(|e| config.locate(e))?;
     let mut time = 0.0;
     for g in 0..plan.groups.len() {
         let (choice, cost) = brick::choose(plan, &plan.groups[g], config)?;

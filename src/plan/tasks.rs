@@ -10,6 +10,7 @@ use crate::config::OutputFormat;
 use crate::gpu::maps::{MapJob, MapLevel};
 use crate::grid::{Region, Shape};
 use crate::store::LevelLayout;
+use crate::{Error, Result};
 
 /// Edges of a task that are aimed at, the first that is small enough: 512^3 u8 voxels take seconds, so that a kill loses little
 /// and a marker costs little, but of a volume of that size nothing would be kept.
@@ -21,6 +22,9 @@ const HALOS_PER_EDGE: usize = 8;
 /// Levels that every brick makes by itself: bricks are multiples of 2^3 on halved axes. Coarser levels are made in the
 /// second phase from cells of this level, 1/512 of the voxels.
 const BRICK_LEVELS: usize = 3;
+
+/// Most tasks of a run, each of which has a mark in memory and in the journal: 2^50 voxels, a petabyte of bytes.
+const MOST_TASKS: usize = 1 << 23;
 
 /// Outputs on one lattice shape, computed brick by brick together.
 #[derive(Debug, Clone)]
@@ -58,7 +62,7 @@ pub struct Task {
 
 impl Group {
     pub fn task_count(&self) -> usize {
-        self.tasks.iter().product()
+        self.tasks.iter().fold(1, |all, &n| all.saturating_mul(n))
     }
 
     /// The box of the group's `i`th task (C order over the task grid).
@@ -195,9 +199,29 @@ pub fn groups(plan: &Plan) -> Vec<Group> {
     for group in &mut groups {
         fill_group(plan, group);
         group.first_task = first_task;
-        first_task += group.task_count();
+        first_task = group.task_count().saturating_add(first_task);
     }
     groups
+}
+
+/// The group as it would be over the whole volume, which pre-passes go over whatever the region is; without bricks.
+pub fn over_all(plan: &Plan, group: &Group) -> Group {
+    let mut all = Group { region: Region::whole(group.shape), ..group.clone() };
+    fill_group(plan, &mut all);
+    all
+}
+
+/// Refuses volumes of more tasks than a run can keep account of.
+pub fn countable(plan: &Plan) -> Result<()> {
+    let all = plan.groups.iter().map(Group::task_count).fold(0, usize::saturating_add);
+    if all <= MOST_TASKS {
+        return Ok(());
+    }
+    let shape = plan.groups[0].region.shape();
+    let message = format!(
+        "{shape:?} voxels (z, y, x) would be {all} tasks; a run keeps account of up to {MOST_TASKS}: give it a part of the volume"
+    );
+    Err(Error::config("run.region", message))
 }
 
 fn fill_group(plan: &Plan, group: &mut Group) {

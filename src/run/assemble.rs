@@ -255,23 +255,31 @@ impl Assembler<'_> {
         if view.dtype() == spec.dtype && place.target.range.is_none() {
             return self.put(place, k, region, view, items);
         }
-        let mut converted = self.pool.take(spec.dtype, region.voxels());
-        convert_at(self.level, view, self.mapping(place), converted.view_mut(region.shape()));
+        if self.in_chunks(place, k) {
+            return self.put_chunks(place, k, region, view, Some(self.mapping(place)), items);
+        }
+        let converted = self.converted(place, view, self.mapping(place));
         let result = self.put(place, k, region, converted.view(region.shape()), items);
         self.pool.put(converted);
         result
     }
 
+    fn converted(&self, place: &Place, view: AnyView, mapping: Mapping) -> Voxels {
+        let shape = view.shape();
+        let mut converted = self.pool.take(place.output.spec.dtype, shape.iter().product());
+        convert_at(self.level, view, mapping, converted.view_mut(shape));
+        converted
+    }
+
+    /// Whether voxels of a level go to chunks that are encoded here.
+    fn in_chunks(&self, place: &Place, k: usize) -> bool {
+        place.output.is_zarr() && place.target.levels[k].is_none()
+    }
+
     /// Hands voxels of the output's type to their chunks: whole ones are encoded at once, parts wait for the rest.
     pub fn put(&self, place: &Place, k: usize, region: Region, view: AnyView, items: &mut Vec<Item>) -> Result<()> {
-        let (output, sink) = (place.output, &place.target.sink);
-        let dataset = k - output.first_level();
-        let mut push = |region: Region, chunk: Encoded| {
-            items.push(Item { output: place.index, dataset, component: place.component, region, chunk });
-        };
-        if !output.is_zarr() {
-            push(region, sink.encode(dataset, region, view)?);
-            return Ok(());
+        if self.in_chunks(place, k) {
+            return self.put_chunks(place, k, region, view, None, items);
         }
         if let Some(spill) = &place.target.levels[k] {
             let mut dense = self.pool.take(view.dtype(), region.voxels());
@@ -280,15 +288,49 @@ impl Assembler<'_> {
             self.pool.put(dense);
             return Ok(());
         }
+        let dataset = k - place.output.first_level();
+        let chunk = place.target.sink.encode(dataset, region, view)?;
+        items.push(Item { output: place.index, dataset, component: place.component, region, chunk });
+        Ok(())
+    }
+
+    /// As [`Assembler::put`]; with a mapping each chunk is converted by itself, and encoded while the cache has it.
+    fn put_chunks(
+        &self,
+        place: &Place,
+        k: usize,
+        region: Region,
+        view: AnyView,
+        mapping: Option<Mapping>,
+        items: &mut Vec<Item>,
+    ) -> Result<()> {
+        let (output, sink) = (place.output, &place.target.sink);
+        let dataset = k - output.first_level();
         let whole = Region::whole(output.level(k).expect("level exists").shape);
         for index in region.cells([0; 3], output.spec.chunk).iter() {
             let chunk = Region::of_cell(index, [0; 3], output.spec.chunk).clip(&whole);
-            if region.contains(&chunk) {
-                push(chunk, sink.encode(dataset, chunk, view.part(region.offset_of(&chunk), chunk.shape()))?);
-            } else if let Some(full) = self.park(place, (place.index, k, place.component, index), chunk, region, view) {
-                push(chunk, sink.encode(dataset, chunk, full.view(chunk.shape()))?);
+            let part = chunk.clip(&region);
+            let piece = view.part(region.offset_of(&part), part.shape());
+            let converted = mapping.map(|m| self.converted(place, piece, m));
+            let piece = converted.as_ref().map_or(piece, |c| c.view(part.shape()));
+            let encoded = if part == chunk {
+                Some(sink.encode(dataset, chunk, piece)?)
+            } else if let Some(full) = self.park(place, (place.index, k, place.component, index), chunk, part, piece) {
+                let encoded = sink.encode(dataset, chunk, full.view(chunk.shape()))?;
                 self.pool.put(full);
-            }
+                Some(encoded)
+            } else {
+                None
+            };
+            converted.into_iter().for_each(|c| self.pool.put(c));
+            let item = |chunk_bytes| Item {
+                output: place.index,
+                dataset,
+                component: place.component,
+                region: chunk,
+                chunk: chunk_bytes,
+            };
+            items.extend(encoded.map(item));
         }
         Ok(())
     }

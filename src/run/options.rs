@@ -15,6 +15,8 @@ pub struct RunOptions {
     pub no_skip: bool,
     /// Chrome/Perfetto trace to write.
     pub trace: Option<PathBuf>,
+    /// Where the caller is going to write the report.
+    pub report: Option<PathBuf>,
     pub cancel: Cancel,
 }
 

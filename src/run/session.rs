@@ -28,7 +28,7 @@ use crate::gpu::Gpu;
 use crate::grid::{Region, order::morton};
 use crate::plan::{BrickChoice, Group, Plan, decodes};
 use crate::store::sink::{Claim, Sink};
-use crate::store::{Source, VolumeInfo, open_inputs};
+use crate::store::{Source, VolumeInfo, open_inputs, read_of, said_of};
 use crate::{Error, Result};
 
 /// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
@@ -67,7 +67,17 @@ pub struct Session<'a> {
 impl<'a> Session<'a> {
     /// Plans, unpacks inputs where needed, runs the pre-passes, opens the outputs.
     pub fn open(config: &'a Config, options: &'a RunOptions, progress: &'a dyn Progress) -> Result<Session<'a>> {
-        Session::open_with(config, open_inputs(config)?, options, progress)
+        let sources = open_inputs(config)?;
+        for path in [&options.trace, &options.report].into_iter().flatten() {
+            if let Some(file) = read_of(&sources, path) {
+                let message = format!(
+                    "would be written over {}, which is read for an input; expected another file",
+                    file.display()
+                );
+                return Err(Error::Config { file: Some(path.clone()), line: None, key: String::new(), message });
+            }
+        }
+        Session::open_with(config, sources, options, progress)
     }
 
     /// As [`Session::open`], on sources of the caller's (arrays in memory, for instance): one per input of the config, in
@@ -186,14 +196,15 @@ impl<'a> Session<'a> {
             std::fs::create_dir_all(&dir).map_err(|e| Error::file(&dir, format!("cannot create scratch: {e}")))?;
             self.scratch = Some(dir.clone());
         }
-        for source in &mut self.sources {
+        for (source, input) in self.sources.iter_mut().zip(&self.config.inputs) {
             let cancel = &self.options.cancel;
-            source.prepare(&dir, &|bytes| {
+            let prepared = source.prepare(&dir, &|bytes| {
                 if total > QUIET_UNPACK {
                     self.progress.update(bytes, total, 0, 0, "unpack");
                 }
                 !cancel.is_cancelled()
-            })?;
+            });
+            prepared.map_err(|e| said_of(self.config, &input.name, e))?;
             self.metrics.bytes_read(source.unpacked_bytes());
         }
         // What was unpacked has no name any more; nothing stays behind, whatever happens.
@@ -335,13 +346,14 @@ impl<'a> Session<'a> {
     fn prepass(&self, id: usize) -> Result<Vec<f64>> {
         let prepass = &self.plan.prepasses[id];
         let lattice = &self.plan.graph.lattices[self.plan.graph.wires[prepass.wires[0]].lattice];
-        let group = self.plan.groups.iter().find(|g| g.shape == lattice.shape).unwrap_or(&self.plan.groups[0]);
+        let group = self.plan.groups.iter().position(|g| g.shape == lattice.shape).unwrap_or(0);
+        let brick = &self.plan.over_all[group];
         let program = Program::of_prepass(&self.plan, prepass, lattice.shape);
         let engine = self.engine();
         let whole = Region::whole(lattice.shape);
-        let mut cells: Vec<[i64; 3]> = whole.cells([0; 3], group.brick.shape).iter().collect();
+        let mut cells: Vec<[i64; 3]> = whole.cells([0; 3], brick.shape).iter().collect();
         cells.sort_by_key(|c| morton(*c));
-        let bricks = cells.into_iter().map(|c| Region::of_cell(c, [0; 3], group.brick.shape).clip(&whole));
+        let bricks = cells.into_iter().map(|c| Region::of_cell(c, [0; 3], brick.shape).clip(&whole));
         let work: Vec<Work> = bricks.map(|brick| Work { brick, slot: 0 }).collect();
         let found = Finder::new(&self.plan, prepass, lattice.shape);
         let deliver = |done: &Finished, _: Work, _: &mut Scratch| {
@@ -352,12 +364,12 @@ impl<'a> Session<'a> {
         let tick = || {
             let (bricks, voxels) = metrics.done();
             self.tick(
-                &group.brick,
+                brick,
                 [voxels, lattice.shape.iter().product::<usize>() as u64, bricks, work.len() as u64],
                 "pre-pass",
             );
         };
-        self.stream(&engine, &program, &group.brick, &work, &metrics, &deliver, &|_, _| Ok(()), &tick)?;
+        self.stream(&engine, &program, brick, &work, &metrics, &deliver, &|_, _| Ok(()), &tick)?;
         self.metrics.absorb(&metrics);
         Ok(found.result(prepass.kind))
     }

@@ -1,5 +1,5 @@
 //! Chunks in blosc's container. The library packs and unpacks; bits of one-byte voxels are shuffled here, several times as fast,
-//! with the same bytes as result.
+//! with the same bytes as result, and bytes of wider ones are joined on their way to where they belong.
 
 use zarrs::array::codec::bytes_to_bytes::blosc::{
     BloscCompressionLevel, BloscCompressor, BloscShuffleMode, blosc_compress_bytes, blosc_decompress_bytes,
@@ -66,14 +66,17 @@ fn pack(raw: &[u8], shuffle: BloscShuffleMode, voxel: usize) -> Result<Vec<u8>, 
     blosc_compress_bytes(raw, level, shuffle, voxel, BloscCompressor::LZ4, 0, 1).map_err(|e| e.to_string())
 }
 
-/// Unpacks one-byte voxels whose bits were shuffled into `dst`; false, and nothing done, for any other container.
+/// Unpacks voxels of so many bytes that were shuffled, by bits if they have one byte, else by bytes, into `dst`, and lets go of the
+/// container before `dst` is written: three times a chunk is more than budgets leave beside them. False, and nothing done, for any
+/// other container.
 ///
 /// # Errors
 /// Broken bytes, or bytes of another number of voxels.
-pub fn decompress_bits(bytes: &mut [u8], dst: &mut [u8]) -> Result<bool, String> {
+pub fn decompress(bytes: &mut Vec<u8>, voxel: usize, dst: &mut [u8]) -> Result<bool, String> {
+    let shuffled = if voxel == 1 { BITS_SHUFFLED } else { BYTES_SHUFFLED };
     if bytes.len() < HEADER
-        || bytes[FLAGS] & (BYTES_SHUFFLED | COPIED | BITS_SHUFFLED) != BITS_SHUFFLED
-        || bytes[3] != 1
+        || bytes[FLAGS] & (BYTES_SHUFFLED | COPIED | BITS_SHUFFLED) != shuffled
+        || bytes[3] as usize != voxel
     {
         return Ok(false);
     }
@@ -82,13 +85,18 @@ pub fn decompress_bits(bytes: &mut [u8], dst: &mut [u8]) -> Result<bool, String>
     if declared != dst.len() {
         return Err(format!("it expands to {declared} bytes, the metadata say {}", dst.len()));
     }
-    bytes[FLAGS] &= !BITS_SHUFFLED;
-    let shuffled = blosc_decompress_bytes(bytes, declared, 1).map_err(|e| e.to_string())?;
-    if shuffled.len() != dst.len() {
-        return Err(format!("it expands to {} bytes, the metadata say {}", shuffled.len(), dst.len()));
+    bytes[FLAGS] &= !shuffled;
+    let unpacked = blosc_decompress_bytes(&std::mem::take(bytes), declared, 1).map_err(|e| e.to_string())?;
+    if unpacked.len() != dst.len() {
+        return Err(format!("it expands to {} bytes, the metadata say {}", unpacked.len(), dst.len()));
     }
     let level = Level::detect();
-    shuffled.chunks(block).zip(dst.chunks_mut(block)).for_each(|(from, to)| bits::unshuffle(level, from, to));
+    for (from, to) in unpacked.chunks(block).zip(dst.chunks_mut(block)) {
+        match voxel {
+            1 => bits::unshuffle(level, from, to),
+            _ => bits::join_bytes(level, voxel, from, to),
+        }
+    }
     Ok(true)
 }
 
@@ -118,7 +126,7 @@ mod tests {
                 let theirs = pack(&raw, BloscShuffleMode::BitShuffle, 1).unwrap();
                 assert_eq!(ours, theirs, "{len} {bits}");
                 let mut back = vec![1; len];
-                let unpacked = decompress_bits(&mut ours, &mut back).unwrap();
+                let unpacked = decompress(&mut ours, 1, &mut back).unwrap();
                 assert_eq!(unpacked, theirs[FLAGS] & COPIED == 0, "{len} {bits}");
                 if unpacked {
                     assert_eq!(back, raw, "{len} {bits}");
@@ -138,12 +146,35 @@ mod tests {
                 blosc_compress_bytes(&raw, level, shuffle, voxel, BloscCompressor::LZ4, block, 1).unwrap()
             };
             let mut back = vec![0; raw.len()];
-            assert!(decompress_bits(&mut packed(BloscShuffleMode::BitShuffle, 1), &mut back).unwrap());
+            assert!(decompress(&mut packed(BloscShuffleMode::BitShuffle, 1), 1, &mut back).unwrap());
             assert_eq!(back, raw, "{block}");
             for (shuffle, voxel) in
                 [(BloscShuffleMode::Shuffle, 1), (BloscShuffleMode::NoShuffle, 1), (BloscShuffleMode::BitShuffle, 2)]
             {
-                assert!(!decompress_bits(&mut packed(shuffle, voxel), &mut back).unwrap());
+                assert!(!decompress(&mut packed(shuffle, voxel), 1, &mut back).unwrap());
+            }
+        }
+    }
+
+    #[test]
+    fn bytes_of_wider_voxels_come_back() {
+        for (voxel, len) in [(2, 1 << 19), (2, 100_002), (4, 262_148), (8, 80_000), (4, 1002), (2, 1)] {
+            let raw = voxels(len, 4);
+            for block in [0, 4096, 10_006] {
+                let level = BloscCompressionLevel::try_from(5).unwrap();
+                let lz4 = BloscCompressor::LZ4;
+                let mut packed =
+                    blosc_compress_bytes(&raw, level, BloscShuffleMode::Shuffle, voxel, lz4, block, 1).unwrap();
+                let mut back = vec![0; len];
+                let copied = packed[FLAGS] & COPIED != 0;
+                assert_eq!(
+                    decompress(&mut packed.clone(), voxel, &mut back).unwrap(),
+                    !copied,
+                    "{voxel} {len} {block}"
+                );
+                assert!(copied || back == raw, "{voxel} {len} {block}");
+                assert!(!decompress(&mut packed.clone(), 2 * voxel, &mut back).unwrap());
+                assert!(copied || decompress(&mut packed, voxel, &mut back[1..]).is_err());
             }
         }
     }
@@ -153,16 +184,16 @@ mod tests {
         let raw = voxels(100_000, 3);
         let whole = compress(&raw, 1, &mut Vec::new()).unwrap();
         let mut back = vec![0; raw.len()];
-        assert!(!decompress_bits(&mut whole[..15].to_vec(), &mut back).unwrap());
-        assert!(decompress_bits(&mut whole[..whole.len() - 1].to_vec(), &mut back).is_err());
-        assert!(decompress_bits(&mut whole.clone(), &mut back[1..]).is_err());
+        assert!(!decompress(&mut whole[..15].to_vec(), 1, &mut back).unwrap());
+        assert!(decompress(&mut whole[..whole.len() - 1].to_vec(), 1, &mut back).is_err());
+        assert!(decompress(&mut whole.clone(), 1, &mut back[1..]).is_err());
         for (at, value) in [(4, 1), (8, 0), (11, 255), (12, 0), (16, 255), (19, 255), (24, 255), (27, 127)] {
             let mut bytes = whole.clone();
             bytes[at] = value;
             if at == 8 {
                 bytes[8..12].fill(0);
             }
-            assert!(decompress_bits(&mut bytes, &mut back).is_err(), "byte {at}");
+            assert!(decompress(&mut bytes, 1, &mut back).is_err(), "byte {at}");
         }
     }
 }

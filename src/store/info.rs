@@ -41,6 +41,18 @@ pub struct Orientation {
     pub space: String,
 }
 
+impl Orientation {
+    /// Origin `[z, y, x]` where the matrix is diagonal and positive (to rounding).
+    pub fn straight_origin(&self) -> Option<[f64; 3]> {
+        let m = &self.matrix;
+        let straight = (0..3).all(|r| {
+            let least = 1e-6 * m[r][r];
+            m[r][r] > 0.0 && (0..3).all(|c| c == r || m[r][c].abs() <= least)
+        });
+        straight.then(|| [m[2][3], m[1][3], m[0][3]])
+    }
+}
+
 impl VolumeInfo {
     /// A scalar volume of which only shape and type are known.
     pub fn plain(shape: Shape, dtype: DType, format: impl Into<String>) -> VolumeInfo {

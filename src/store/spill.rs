@@ -10,6 +10,22 @@ use super::os;
 use crate::grid::{Region, Shape};
 use crate::{Error, Result};
 
+/// Reserves a file's room, or leaves it as it was: a file system may hand out all that it has before it says that this is too little.
+fn reserve(file: &File, path: &Path, bytes: u64) -> std::io::Result<()> {
+    let had = file.metadata()?.len();
+    let free = path.parent().and_then(os::free_bytes).unwrap_or(u64::MAX);
+    let reserved = match bytes.saturating_sub(had) {
+        more if more > free => {
+            let why = format!("the file system has room for {free} bytes more");
+            Err(std::io::Error::new(std::io::ErrorKind::StorageFull, why))
+        }
+        _ => os::reserve(file, bytes),
+    };
+    reserved.inspect_err(|_| {
+        let _ = if had == 0 { std::fs::remove_file(path) } else { file.set_len(had) };
+    })
+}
+
 /// `planes` dense arrays of one shape and item size, one after the other, in a file.
 #[derive(Debug)]
 pub struct Spill {
@@ -37,7 +53,7 @@ impl Spill {
             .truncate(false)
             .open(path)
             .map_err(|e| fail("open", e))?;
-        os::reserve(&file, bytes.max(1) as u64).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
+        reserve(&file, path, bytes.max(1) as u64).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
         let map = MmapRaw::map_raw(&file).map_err(|e| fail("map", e))?;
         Ok(Spill { path: path.to_path_buf(), file, map, shape, planes, item })
     }
@@ -104,5 +120,21 @@ mod tests {
         assert_eq!(out, bytes);
         again.read(0, region, &mut out);
         assert_eq!(out, [0; 16]);
+    }
+
+    #[test]
+    fn what_does_not_fit_leaves_the_disk_as_it_was() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cells");
+        let huge = [1 << 20, 1 << 20, 1 << 8];
+        let error = Spill::open(&path, huge, 2, 8).unwrap_err().to_string();
+        assert!(error.contains("cells") && error.contains("has room for"), "{error}");
+        assert!(!path.exists());
+        Spill::open(&path, [3, 2, 5], 2, 2).unwrap().write(0, Region::whole([1, 1, 2]), &[1, 2, 3, 4]);
+        assert!(Spill::open(&path, huge, 2, 8).is_err());
+        assert_eq!(std::fs::metadata(&path).unwrap().len(), 120);
+        let mut out = vec![9; 4];
+        Spill::open(&path, [3, 2, 5], 2, 2).unwrap().read(0, Region::whole([1, 1, 2]), &mut out);
+        assert_eq!(out, [1, 2, 3, 4]);
     }
 }

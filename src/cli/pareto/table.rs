@@ -185,7 +185,7 @@ mod tests {
     use crate::config::Sample;
 
     fn row(settings: Table, seconds: f64, rmse: f64) -> Row {
-        let all = Difference { rmse, mae: 0.0, bias: 0.0, max_abs: 0.0, p99: 0.0, ssim: None, n: 1 };
+        let all = Difference { rmse, mae: 0.0, bias: 0.0, max_abs: 0.0, p99: 0.0, ssim: None, n: 1, missing: [0; 2] };
         Row {
             settings,
             cost: Cost { seconds, ..Cost::default() },

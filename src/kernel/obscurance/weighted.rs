@@ -128,6 +128,8 @@ fn add_pieces<H: Hit>(sum: &mut WeightedSum, visit: &Visit, strip: &Strip, forwa
         };
         let frame = usize::from(last == 0);
         let first = contribute::start(strides(visit.perm.map(|a| sum.tile.shape()[a])), strip, &piece);
+        // What both senses add, to the weights, to openness and to three colours: one way through memory for the two.
+        let mut totals = [[0; LANES]; 5];
         for (way, answers) in [forward, backward].into_iter().enumerate() {
             let (Some(sense), false) = (&visit.family.senses[way], answers.is_empty()) else { continue };
             let answers = &answers[piece.answers.clone()];
@@ -143,32 +145,48 @@ fn add_pieces<H: Hit>(sum: &mut WeightedSum, visit: &Visit, strip: &Strip, forwa
             }
             let mut seen = weights;
             for (seen, answer) in seen.iter_mut().zip(answers) {
+                // The last entry is that of the open.
                 let steps = answer.steps();
-                *seen *= if steps >= visit.reach { 1.0 } else { visit.family.rho[steps] };
+                *seen *= visit.family.rho[if steps >= visit.reach { visit.family.reach } else { steps }];
             }
+            let [of_weights, open, rgb @ ..] = &mut totals;
             if sum.normal.is_some() {
-                spread(sum.weights[frame], &weights, first, n);
-                spread(sum.open[frame], &seen, first, n);
+                gather(of_weights, &weights);
+                gather(open, &seen);
             }
             if let Some(colour) = &sum.colour {
                 let colours = colours(colour, sum.ambient, sum.src_box, visit, way, strip.axis, p, answers);
-                for (rgb, colour) in sum.rgb.iter_mut().zip(&colours) {
+                for (rgb, colour) in rgb.iter_mut().zip(&colours) {
                     let mut light = seen;
                     light.iter_mut().zip(colour).for_each(|(light, c)| *light *= c);
-                    spread(rgb[frame], &light, first, n);
+                    gather(rgb, &light);
                 }
             }
+        }
+        let [of_weights, open, rgb @ ..] = &totals;
+        if sum.normal.is_some() {
+            spread(sum.weights[frame], of_weights, first, n);
+            spread(sum.open[frame], open, first, n);
+        }
+        if sum.colour.is_some() {
+            sum.rgb.iter_mut().zip(rgb).for_each(|(sums, lanes)| spread(sums[frame], lanes, first, n));
         }
     }
 }
 
+/// Adds lanes in units of the sums.
+#[inline(always)]
+fn gather(totals: &mut [i64; LANES], lanes: &Lanes) {
+    totals.iter_mut().zip(lanes).for_each(|(total, l)| *total += fixed(*l));
+}
+
 /// Adds `n` lanes to sums.
 #[inline(always)]
-fn spread(sums: &mut [i64], lanes: &Lanes, first: usize, n: usize) {
+fn spread(sums: &mut [i64], lanes: &[i64; LANES], first: usize, n: usize) {
     let sums = &mut sums[first..first + n];
     match <&mut [i64; LANES]>::try_from(&mut *sums) {
-        Ok(sums) => sums.iter_mut().zip(lanes).for_each(|(sum, l)| *sum += fixed(*l)),
-        Err(_) => sums.iter_mut().zip(lanes).for_each(|(sum, l)| *sum += fixed(*l)),
+        Ok(sums) => sums.iter_mut().zip(lanes).for_each(|(sum, l)| *sum += l),
+        Err(_) => sums.iter_mut().zip(lanes).for_each(|(sum, l)| *sum += l),
     }
 }
 

@@ -10,7 +10,7 @@ use crate::brick::scratch::{cut, padded};
 use crate::grid::{DType, Shape, View, ViewMut};
 use crate::kernel::levels::search::{as_bytes, bytes};
 use crate::kernel::levels::sums::{Asked, NEVER, Sum, Tile, Windows, Work, sweep};
-use crate::kernel::simd::Level;
+use crate::kernel::simd::{Level, fetch};
 use crate::multiversion;
 use crate::stage::Ties;
 
@@ -278,18 +278,6 @@ impl Job<'_> {
             mid,
         })
     }
-}
-
-/// Asks for a row that is written soon: of all voxels, a group writes a few here and there.
-#[inline(always)]
-fn fetch(row: &[f32]) {
-    #[cfg(target_arch = "x86_64")]
-    for line in row.chunks(16) {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: a hint, and every x86-64 has it.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
-    }
-    let _ = row;
 }
 
 multiversion! {

@@ -39,6 +39,13 @@ fn native<T: Voxel>(row: &[T]) -> &[u8] {
     unsafe { std::slice::from_raw_parts(row.as_ptr().cast::<u8>(), size_of_val(row)) }
 }
 
+/// The bytes of a dense box of this shape, where they are stored as this machine has them.
+fn whole<T: Voxel>(v: View<'_, T>, chunk: Shape) -> Option<&[u8]> {
+    let [nz, ny, nx] = v.shape;
+    let dense = v.row == nx && v.plane == nx * ny && v.shape == chunk && cfg!(target_endian = "little");
+    dense.then(|| native(&v.data[..nz * ny * nx]))
+}
+
 /// Appends voxels, little-endian.
 fn append_le<T: Voxel>(row: &[T], out: &mut Vec<u8>) {
     let start = out.len();
@@ -65,13 +72,17 @@ impl Encoder {
             if self.holds_only_fill(v) {
                 return Ok(Encoded::Empty);
             }
+            let size = voxels.dtype().size();
+            if let (Some(bytes), true) = (whole(v, chunk), self.codec != Codec::None) {
+                return self.compress(bytes, size).map(Encoded::Bytes);
+            }
             let mut raw = self.buffer();
             raw.clear();
             self.pad(v, chunk, &mut raw);
-            let encoded = self.compress(&raw, voxels.dtype().size());
             if self.codec == Codec::None {
                 return Ok(Encoded::Bytes(raw));
             }
+            let encoded = self.compress(&raw, size);
             self.reuse(raw);
             encoded.map(Encoded::Bytes)
         })
@@ -104,8 +115,8 @@ impl Encoder {
         let [nz, ny, nx] = v.shape;
         let repeat = |out: &mut Vec<u8>, n: usize| (0..n).for_each(|_| out.extend_from_slice(&self.fill));
         out.reserve_exact(chunk.iter().product::<usize>() * size);
-        if v.row == nx && v.plane == nx * ny && v.shape == chunk {
-            return append_le(&v.data[..nz * ny * nx], out);
+        if let Some(bytes) = whole(v, chunk) {
+            return out.extend_from_slice(bytes);
         }
         for z in 0..nz {
             for y in 0..ny {

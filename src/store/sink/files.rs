@@ -16,13 +16,13 @@ pub fn cannot_write(path: &Path, error: io::Error) -> Error {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Error::file(
             path,
             format!(
-                "cannot be written: no room left on the device ({error}); what was finished is kept, make room and --resume"
+                "cannot be written: no room left on the device ({error}); finished tasks are kept, make room and --resume"
             ),
         ),
         io::ErrorKind::FileTooLarge => Error::file(
             path,
             format!(
-                "cannot be written: larger than a file may be here ({error}; see ulimit -f); what was finished is kept, --resume continues"
+                "cannot be written: larger than a file may be here ({error}; see ulimit -f); finished tasks are kept, --resume goes on with the rest"
             ),
         ),
         _ => Error::file(path, format!("cannot be written: {error}")),

@@ -115,15 +115,19 @@ impl Files {
 
 /// Opens a file for reading; the error names it.
 pub fn open_file(path: &Path) -> Result<File> {
-    let file = File::open(path).map_err(|e| match e.kind() {
+    let failed = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::NotFound => Error::file(path, "no such file"),
         _ => Error::file(path, format!("cannot be opened: {e}")),
-    })?;
-    let meta = file.metadata().map_err(|e| Error::file(path, e))?;
+    };
+    // Before it is opened: a pipe would wait for somebody to write.
+    let meta = std::fs::metadata(path).map_err(failed)?;
     if meta.is_dir() {
         return Err(Error::file(path, "is a folder; a file is expected here"));
     }
-    Ok(file)
+    if !meta.is_file() {
+        return Err(Error::file(path, "neither a file nor a folder; a file is expected here"));
+    }
+    File::open(path).map_err(failed)
 }
 
 /// Bytes of a file.

@@ -36,7 +36,7 @@ use crate::{Error, Result};
 use detect::Format;
 use flat::Unpacked;
 use lattice::Lattice;
-use planar::{Planar, components, key};
+use planar::{Planar, key};
 
 /// An open volume. Reading needs only `&self` and is safe from several threads.
 #[derive(Debug)]
@@ -296,9 +296,6 @@ fn open_path(input: &Input, path: &Path, raw: Option<&crate::config::RawFormat>)
         (_, Some(Format::Tiff)) => tiff::open(input, path)?,
         _ => raw::open_npy(input, path)?,
     };
-    if raw.is_some() {
-        components(input, 1, 1, &[])?;
-    }
     let (info, planar) = Planar::new(parsed)?;
     Ok((info, Kind::Planar(planar)))
 }
@@ -330,7 +327,7 @@ fn overridden(mut info: VolumeInfo, input: &Input) -> Result<VolumeInfo> {
         info.unit = units::normalise(unit);
     }
     if let Some(orientation) = &info.orientation {
-        info.origin = straight_origin(&orientation.matrix).unwrap_or([0.0; 3]);
+        info.origin = orientation.straight_origin().unwrap_or([0.0; 3]);
     }
     if let Some(origin) = input.origin {
         if !origin.iter().all(|v| v.is_finite()) {
@@ -354,15 +351,6 @@ fn overridden(mut info: VolumeInfo, input: &Input) -> Result<VolumeInfo> {
     }
     info.nodata = input.nodata.or(info.nodata);
     Ok(info)
-}
-
-/// Origin `[z, y, x]` of a direction matrix that is diagonal and positive (to rounding); `None` otherwise.
-fn straight_origin(matrix: &[[f64; 4]; 3]) -> Option<[f64; 3]> {
-    let straight = (0..3).all(|r| {
-        let least = 1e-6 * matrix[r][r];
-        matrix[r][r] > 0.0 && (0..3).all(|c| c == r || matrix[r][c].abs() <= least)
-    });
-    straight.then(|| [matrix[2][3], matrix[1][3], matrix[0][3]])
 }
 
 /// A shorter borrow of the same voxels.

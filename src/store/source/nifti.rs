@@ -185,6 +185,26 @@ fn orientation(h: &Header) -> Option<Orientation> {
     matrix.iter().flatten().all(|v| v.is_finite()).then(|| Orientation { matrix, space: "RAS".to_string() })
 }
 
+/// Spacing from the matrix where that contradicts `pixdim`: it is the matrix that says where voxels lie, and which outputs keep.
+fn follow_matrix(info: &mut VolumeInfo, axes: usize) {
+    let Some(orientation) = &info.orientation else { return };
+    let written = info.spacing;
+    for column in 0..axes.min(3) {
+        let length = (0..3).map(|r| orientation.matrix[r][column].powi(2)).sum::<f64>().sqrt();
+        let own = &mut info.spacing[2 - column];
+        // Headers hold both as f32, a quaternion with fewer digits still.
+        if length.is_normal() && (length / *own - 1.0).abs() > 1e-4 {
+            *own = length;
+        }
+    }
+    if info.spacing != written {
+        info.warnings.push(format!(
+            "pixdim says that voxels measure {written:?} (z, y, x), the affine {:?}: the affine counts; `spacing` would be what you set",
+            info.spacing
+        ));
+    }
+}
+
 /// Opens a `.nii` or `.nii.gz` file. Axis 4 is time, axis 5 the channel; the others must be 1.
 pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let start = bytes::file_head(path, MOST_HEADER)?;
@@ -244,6 +264,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     };
     info.affine = Affine::new(h.slope, h.intercept);
     info.orientation = orientation(&h);
+    follow_matrix(&mut info, axes as usize);
     let pending = if gzip {
         (packed.skip, packed.len) = (base, len);
         Pending::Unpack(packed)

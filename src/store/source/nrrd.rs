@@ -192,8 +192,12 @@ fn space_name(text: &str) -> (String, bool) {
 /// What each axis is, fastest first: space or an extra one.
 fn axes(path: &Path, h: &Header, sizes: &[u64], directions: &[Option<Vec<f64>>]) -> Result<Vec<Axis>> {
     let kinds: Vec<String> = h.get("kinds").map(words).unwrap_or_default().iter().map(|k| k.to_lowercase()).collect();
+    let spacings = numbers::<f64>(path, h, "spacings", sizes.len())?.unwrap_or_default();
+    // Among more than three axes, those without a spacing are none of space.
+    let measured = sizes.len() > 3 && spacings.iter().filter(|s| !s.is_nan()).count() >= 3;
     let spatial = |a: usize| match directions.get(a) {
         Some(direction) => direction.is_some(),
+        None if kinds.is_empty() && measured => !spacings[a].is_nan(),
         None => kinds.get(a).is_none_or(|k| matches!(k.as_str(), "domain" | "space" | "???" | "none")),
     };
     let mut seen = 0;
@@ -215,14 +219,44 @@ fn axes(path: &Path, h: &Header, sizes: &[u64], directions: &[Option<Vec<f64>>])
     Ok(out)
 }
 
-/// Where each axis begins, and how many cells behind that its first voxel lies: half a one where the header says that
-/// samples are centred in cells. `None` where the header does not say.
-fn axis_mins(path: &Path, h: &Header, count: usize) -> Result<Vec<Option<[f64; 2]>>> {
-    let Some(mins) = numbers::<f64>(path, h, "axis mins", count)? else { return Ok(Vec::new()) };
+/// Where an axis begins and ends.
+struct Span {
+    min: Option<f64>,
+    max: Option<f64>,
+    /// Samples stand in the middle of cells of which the first begins at `min`; else the first stands there.
+    cells: bool,
+}
+
+impl Span {
+    /// From sample to sample of `n`, where both ends are known.
+    fn spacing(&self, n: u64) -> Option<f64> {
+        let steps = if self.cells { n } else { n.saturating_sub(1) } as f64;
+        Some((self.max? - self.min?) / steps).filter(|s| s.is_finite() && *s != 0.0)
+    }
+
+    /// Place of the first sample.
+    fn first(&self, spacing: f64) -> Option<f64> {
+        Some(self.min? + if self.cells { 0.5 * spacing } else { 0.0 })
+    }
+}
+
+/// `axis mins` and `axis maxs` of all axes. Where the header does not say how samples are centred, cells are meant if both ends are
+/// there, as teem takes it.
+fn spans(path: &Path, h: &Header, count: usize) -> Result<Vec<Span>> {
+    let ends = |name| Ok(numbers::<f64>(path, h, name, count)?.unwrap_or_default());
+    let (mins, maxs): (Vec<f64>, Vec<f64>) = (ends("axis mins")?, ends("axis maxs")?);
     let centres = h.get("centerings").map(words).unwrap_or_default();
-    let in_cells = |a: usize| centres.get(a).is_some_and(|c| c.eq_ignore_ascii_case("cell"));
-    let one = |(a, min): (usize, &f64)| min.is_finite().then(|| [*min, if in_cells(a) { 0.5 } else { 0.0 }]);
-    Ok(mins.iter().enumerate().map(one).collect())
+    let known = |list: &[f64], a: usize| list.get(a).copied().filter(|v| v.is_finite());
+    let one = |a: usize| {
+        let (min, max) = (known(&mins, a), known(&maxs, a));
+        let cells = match centres.get(a).map(|c| c.to_lowercase()).as_deref() {
+            Some("cell") => true,
+            Some("node") => false,
+            _ => min.is_some() && max.is_some(),
+        };
+        Span { min, max, cells }
+    };
+    Ok((0..count).map(one).collect())
 }
 
 /// Spacing, unit and orientation into `info`.
@@ -235,10 +269,14 @@ fn geometry(
 ) -> Result<()> {
     let space: Vec<usize> = (0..axes.len()).filter(|a| matches!(axes[*a], Axis::Space(_))).collect();
     // NaN marks axes without a spacing.
-    if let Some(spacings) = numbers::<f64>(path, h, "spacings", axes.len())? {
-        for (i, a) in space.iter().enumerate() {
-            info.spacing[2 - i] = if spacings[*a].is_nan() { 1.0 } else { spacings[*a].abs() };
-        }
+    let spacings = numbers::<f64>(path, h, "spacings", axes.len())?.unwrap_or_default();
+    let spans = spans(path, h, axes.len())?;
+    // Signed: mins and maxs may run backwards.
+    let mut steps = [1.0; 3];
+    for (i, &a) in space.iter().enumerate() {
+        let own = spacings.get(a).copied().filter(|s| !s.is_nan()).map(f64::abs);
+        steps[2 - i] = own.or_else(|| spans[a].spacing(axes[a].size())).unwrap_or(1.0);
+        info.spacing[2 - i] = steps[2 - i].abs();
     }
     let (name, medical) = h.get("space").map(space_name).unwrap_or_default();
     let origin = h.get("space origin").map(|t| vectors(path, "space origin", t)).transpose()?;
@@ -261,11 +299,8 @@ fn geometry(
         (0..3).for_each(|r| matrix[r][3] = origin.get(r).copied().filter(|v| v.is_finite()).unwrap_or(0.0));
         info.orientation = Some(Orientation { matrix, space: if name.is_empty() { "unknown".into() } else { name } });
     } else {
-        let mins = axis_mins(path, h, axes.len())?;
         for r in 0..3 {
-            let min = || {
-                space.get(r).and_then(|a| mins.get(*a).copied()?).map(|[min, cells]| min + cells * info.spacing[2 - r])
-            };
+            let min = || space.get(r).and_then(|a| spans[*a].first(steps[2 - r]));
             let known = |v: &f64| v.is_finite();
             info.origin[2 - r] = origin.get(r).copied().filter(known).or_else(min).unwrap_or(0.0);
         }

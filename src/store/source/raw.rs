@@ -21,10 +21,20 @@ pub fn open_raw(input: &Input, path: &Path, raw: &RawFormat) -> Result<Parsed> {
     let shape = shape_of(path, raw.shape.map(|n| n as u64), raw.dtype.size())
         .map_err(|_| Error::config(key(input, "shape"), format!("{:?} is larger than any file", raw.shape)))?;
     let too_far = || Error::config(key(input, "offset"), format!("{} is larger than any file", raw.offset));
-    let lattice = |base| Lattice::dense(shape, raw.dtype, raw.big_endian, base).ok_or_else(too_far);
+    let one = shape.iter().product::<usize>() as u64 * raw.dtype.size() as u64;
+    let all = one.checked_mul(raw.components as u64).ok_or_else(too_far)?;
+    let (pairs, names) = components(input, 1, raw.components, &[])?;
+    let lattice = |base: u64| {
+        base.checked_add(all).ok_or_else(too_far)?;
+        let mut lattice = Lattice::dense(shape, raw.dtype, raw.big_endian, base).ok_or_else(too_far)?;
+        if let Planes::Even { bases, .. } = &mut lattice.planes {
+            *bases = pairs.iter().map(|(_, c)| base + *c as u64 * one).collect();
+        }
+        Ok::<_, Error>(lattice)
+    };
     let packed = start == [0x1f, 0x8b] && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("gz"));
     let (lattice, pending) = if packed {
-        let len = shape.iter().product::<usize>() as u64 * raw.dtype.size() as u64;
+        let len = all;
         lattice(raw.offset)?;
         let (path, trailing_ignore) = (path.to_path_buf(), raw.trailing_ignore);
         let packed = Packed { path, packing: Packing::Gzip, start: 0, skip: raw.offset, len, trailing_ignore };
@@ -32,7 +42,8 @@ pub fn open_raw(input: &Input, path: &Path, raw: &RawFormat) -> Result<Parsed> {
     } else {
         (lattice(raw.offset)?, Pending::Nothing)
     };
-    let info = VolumeInfo::plain(shape, raw.dtype, if packed { "raw, gzip" } else { "raw" });
+    let mut info = VolumeInfo::plain(shape, raw.dtype, if packed { "raw, gzip" } else { "raw" });
+    (info.components, info.component_names) = (pairs.len(), names);
     let header = format!("{raw:?}").into_bytes();
     Ok(Parsed { info, lattice, files: vec![path.to_path_buf()], pending, header, exact: !raw.trailing_ignore })
 }

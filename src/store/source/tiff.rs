@@ -1,7 +1,7 @@
 //! TIFF stacks: many pages in one file, or a folder of slices in natural order.
 
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use tiff::decoder::{Decoder, Limits};
@@ -29,7 +29,42 @@ pub const MOST_CHUNK: usize = 1 << 30;
 const IMAGE_DEPTH: Tag = Tag::Unknown(32997);
 const TILE_DEPTH: Tag = Tag::Unknown(32998);
 
-pub type Reader = Decoder<BufReader<File>>;
+pub type Reader = Decoder<Buffered>;
+
+/// Bytes that a reader has at hand: more than decoders ask for at once, which would go past the buffer.
+const AT_HAND: usize = 128 << 10;
+
+/// A file behind a buffer that a seek inside it does not empty: decoders seek to every strip, and strips may be a few bytes.
+pub struct Buffered {
+    file: BufReader<File>,
+    at: u64,
+}
+
+impl Read for Buffered {
+    fn read(&mut self, to: &mut [u8]) -> std::io::Result<usize> {
+        let n = self.file.read(to)?;
+        self.at += n as u64;
+        Ok(n)
+    }
+}
+
+impl Seek for Buffered {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        let by = match to {
+            SeekFrom::Start(at) => i64::try_from(at as i128 - self.at as i128).ok(),
+            SeekFrom::Current(by) => Some(by),
+            SeekFrom::End(_) => None,
+        };
+        match by {
+            Some(by) => {
+                self.file.seek_relative(by)?;
+                self.at = self.at.wrapping_add_signed(by);
+            }
+            None => self.at = self.file.seek(to)?,
+        }
+        Ok(self.at)
+    }
+}
 
 /// Opens a TIFF file at its first page, believing in tables of tags and in strips or tiles of up to `most` bytes.
 pub fn reader(path: &Path, most: usize) -> Result<Reader> {
@@ -38,7 +73,8 @@ pub fn reader(path: &Path, most: usize) -> Result<Reader> {
     let mut limits = Limits::default();
     limits.decoding_buffer_size = most;
     limits.intermediate_buffer_size = most;
-    Ok(Decoder::new(BufReader::new(file)).map_err(|e| broken(path, 0, e))?.with_limits(limits))
+    let file = Buffered { file: BufReader::with_capacity(AT_HAND, file), at: 0 };
+    Ok(Decoder::new(file).map_err(|e| broken(path, 0, e))?.with_limits(limits))
 }
 
 /// Refuses a first directory whose tags claim more values than the file has bytes: the decoder takes limits only after
@@ -146,6 +182,12 @@ fn page(path: &Path, decoder: &mut Reader, file: u32, image: usize, display: boo
         return Ok(None);
     }
     let compression = number(Tag::Compression, 1)?;
+    if !matches!(compression, 1 | 5 | 7 | 8 | 32773 | 32946 | 50000) {
+        let text = format!(
+            "{compression} is no compression that is read; accepted are none, LZW, Deflate, PackBits, JPEG and zstd"
+        );
+        return Err(broken(path, image, text));
+    }
     let predictor = number(Tag::Predictor, 1)?;
     let photometric = number(Tag::PhotometricInterpretation, 1)?;
     let samples = number(Tag::SamplesPerPixel, 1)?;
@@ -275,7 +317,9 @@ fn slices(folder: &Path) -> Result<Vec<PathBuf>> {
     for entry in std::fs::read_dir(folder).map_err(|e| Error::file(folder, e))? {
         let path = entry.map_err(|e| Error::file(folder, e))?.path();
         let tiff = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("tif") || e.eq_ignore_ascii_case("tiff"));
-        if tiff && !path.is_dir() {
+        // Hidden files are some system's own (`._slice.tif`).
+        let hidden = path.file_name().is_some_and(|n| n.as_encoded_bytes().starts_with(b"."));
+        if tiff && !hidden && !path.is_dir() {
             found.push(path);
         }
     }

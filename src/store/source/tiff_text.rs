@@ -165,8 +165,9 @@ fn ome(path: &Path, xml: &str, plain: Described) -> Result<Described> {
     described.unit = ["X", "Y", "Z"].into_iter().find_map(unit).flatten();
     for (i, axis) in ["Z", "Y", "X"].into_iter().enumerate() {
         let own = unit(axis).unwrap_or_else(|| described.unit.clone());
-        let factor = units::to_one(described.unit.as_deref(), own.as_deref()).map_err(|why| Error::file(path, why))?;
-        described.spacing[i] = length(axis).filter(|v| v.is_finite() && *v > 0.0).map_or(1.0, |v| v * factor);
+        let size = length(axis).filter(|v| v.is_finite() && *v > 0.0);
+        let size = size.map(|v| units::to_one(v, described.unit.as_deref(), own.as_deref())).transpose();
+        described.spacing[i] = size.map_err(|why| Error::file(path, why))?.unwrap_or(1.0);
     }
     described.labels =
         tags(body, "Channel").map(|(b, _)| attribute(b, "Name").map(unescape).unwrap_or_default()).collect();

@@ -1,6 +1,6 @@
 //! Unit names as files spell them, to UDUNITS names.
 
-use crate::config::units::{to_metres, udunits_name};
+use crate::config::units::{converted, udunits_name};
 
 /// UDUNITS name of a length unit as files spell it (`mm`, `µm`, `micron`, ...). `None` for an empty name and for
 /// "units" that carry no length (`pixel`, `voxel`, `none`); a name that is not known here is kept in lower case.
@@ -17,24 +17,18 @@ pub fn normalise(text: &str) -> Option<String> {
     Some(known.or_else(escaped).map_or(low, str::to_string))
 }
 
-/// What lengths in `own` units are to be multiplied by to be in `unit`: axes of one volume may have units of their own.
+/// A length in `own` units as a number of `unit`: axes of one volume may have units of their own.
 ///
 /// # Errors
 /// Says which units cannot be brought together.
-pub fn to_one(unit: Option<&str>, own: Option<&str>) -> Result<f64, String> {
+pub fn to_one(value: f64, unit: Option<&str>, own: Option<&str>) -> Result<f64, String> {
     if unit == own {
-        return Ok(1.0);
+        return Ok(value);
     }
-    match (unit.and_then(to_metres), own.and_then(to_metres)) {
-        (Some(one), Some(other)) => Ok(other / one),
-        _ => {
-            let name = |u: Option<&str>| u.unwrap_or("none").to_string();
-            let (unit, own) = (name(unit), name(own));
-            Err(format!(
-                "its axes have different units ({unit}, {own}), which cannot be brought to one; write one unit into it"
-            ))
-        }
-    }
+    unit.zip(own).and_then(|(unit, own)| converted(value, own, unit)).ok_or_else(|| {
+        let [unit, own] = [unit, own].map(|u| u.unwrap_or("none"));
+        format!("its axes have different units ({unit}, {own}), which cannot be brought to one; write one unit into it")
+    })
 }
 
 #[cfg(test)]
@@ -43,11 +37,12 @@ mod tests {
 
     #[test]
     fn lengths_come_to_one_unit() {
-        assert_eq!(to_one(Some("micrometer"), Some("micrometer")), Ok(1.0));
-        assert_eq!(to_one(Some("parsec"), Some("parsec")), Ok(1.0));
-        assert!((to_one(Some("micrometer"), Some("nanometer")).unwrap() - 1e-3).abs() < 1e-18);
-        assert!(to_one(Some("micrometer"), None).unwrap_err().contains("(micrometer, none)"));
-        assert!(to_one(Some("furlong"), Some("micrometer")).is_err());
+        assert_eq!(to_one(2.5, Some("micrometer"), Some("micrometer")), Ok(2.5));
+        assert_eq!(to_one(1.0, Some("parsec"), Some("parsec")), Ok(1.0));
+        assert_eq!(to_one(2.5, Some("nanometer"), Some("micrometer")), Ok(2500.0));
+        assert_eq!(to_one(1.0, Some("micrometer"), Some("nanometer")), Ok(1e-3));
+        assert!(to_one(1.0, Some("micrometer"), None).unwrap_err().contains("(micrometer, none)"));
+        assert!(to_one(1.0, Some("furlong"), Some("micrometer")).is_err());
     }
 
     #[test]

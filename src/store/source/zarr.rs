@@ -41,8 +41,8 @@ pub struct ZarrArray {
     /// Chunks of the volume along z, y, x.
     grid: [i64; 3],
     options: CodecOptions,
-    /// Chunks are blosc's containers of one component's one-byte voxels, and nothing else.
-    bits_only: bool,
+    /// Chunks are blosc's containers of one component's voxels, in the order of this machine's bytes, and nothing else.
+    plain_blosc: bool,
     /// Folders that changed later may have lost chunks.
     opened: SystemTime,
 }
@@ -176,7 +176,11 @@ fn other_order(meta: &ArrayMeta, multiscale: Option<&Multiscale>, lead: usize) -
 /// Spacing, origin and unit of the space axes.
 fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut VolumeInfo) -> Result<()> {
     let unit = |a: usize| m.axes.get(a).and_then(|axis| axis.2.as_deref());
-    info.unit = unit(lead).map(str::to_string);
+    let one = (lead..n).find_map(unit);
+    info.unit = one.map(str::to_string);
+    if let (Some(one), true) = (one, (lead..n).any(|a| unit(a).is_none())) {
+        info.warnings.push(format!("some of its axes have no unit: they are taken to be in {one}, as the others are"));
+    }
     for a in lead..n {
         let i = 3 - (n - a);
         info.spacing[i] = m.scale.get(a).copied().unwrap_or(1.0);
@@ -184,9 +188,9 @@ fn geometry(path: &Path, m: &Multiscale, lead: usize, n: usize, info: &mut Volum
         if info.shape[i] == 1 && info.spacing[i].partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
             info.spacing[i] = 1.0;
         }
-        let factor = units::to_one(unit(lead), unit(a)).map_err(|why| Error::file(path, why))?;
-        info.spacing[i] *= factor;
-        info.origin[i] *= factor;
+        for length in [&mut info.spacing[i], &mut info.origin[i]] {
+            *length = units::to_one(*length, one, unit(a).or(one)).map_err(|why| Error::file(path, why))?;
+        }
     }
     Ok(())
 }
@@ -273,10 +277,7 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     // A server's clock may run ahead of this machine's.
     let touched = folder.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
     let opened = touched.max(SystemTime::now());
-    let plain =
-        meta.codecs == ["bytes", "blosc"] || meta.codecs == ["blosc"] && meta.value["order"].as_str() == Some("C");
-    let bits_only =
-        plain && meta.packing.is_none() && meta.dtype.size() == 1 && meta.inner[..lead].iter().all(|n| *n == 1);
+    let plain_blosc = meta.packing.is_none() && meta.inner[..lead].iter().all(|n| *n == 1) && meta.is_plain_blosc();
     Ok((
         info,
         ZarrArray {
@@ -291,7 +292,7 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
             components,
             grid,
             options,
-            bits_only,
+            plain_blosc,
             opened,
         },
     ))
@@ -349,8 +350,8 @@ impl ZarrArray {
         let corrupt = |e: String| Error::file(&path, format!("chunk {index:?} cannot be decoded: {e}"));
         let size = self.meta.dtype.size() as u64;
         let want = self.meta.inner.iter().product::<u64>() * size;
-        if self.bits_only && dst.dtype() == self.meta.dtype {
-            let done = guarded(|| blosc::decompress_bits(&mut bytes, dst.as_bytes_mut())).map_err(corrupt)?;
+        if self.plain_blosc && dst.dtype() == self.meta.dtype {
+            let done = guarded(|| blosc::decompress(&mut bytes, size as usize, dst.as_bytes_mut())).map_err(corrupt)?;
             if done {
                 return Ok(ChunkRead::Data { stored_bytes });
             }

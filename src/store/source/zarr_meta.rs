@@ -52,6 +52,22 @@ pub struct ShardMeta {
     pub grid: Vec<u64>,
 }
 
+impl ArrayMeta {
+    /// Whether a chunk is one of blosc's containers, of voxels along x, y and z as this machine has them in memory.
+    pub fn is_plain_blosc(&self) -> bool {
+        let (swapped, v2_swapped) = if cfg!(target_endian = "little") { ("big", '>') } else { ("little", '<') };
+        if self.version == 2 {
+            let dtype = self.value["dtype"].as_str().unwrap_or("");
+            return self.codecs == ["blosc"]
+                && self.value["order"].as_str() == Some("C")
+                && (self.dtype.size() == 1 || !dtype.starts_with(v2_swapped));
+        }
+        let list = self.shard.as_ref().map_or(&self.value["codecs"], |shard| &shard.codecs);
+        self.codecs == ["bytes", "blosc"]
+            && (self.dtype.size() == 1 || list[0]["configuration"]["endian"].as_str().is_some_and(|e| e != swapped))
+    }
+}
+
 /// Reads a JSON file of a Zarr folder; `None` where it does not exist.
 pub fn json(path: &Path) -> Result<Option<(Value, Vec<u8>)>> {
     if !path.is_file() {
@@ -107,6 +123,12 @@ pub fn array(folder: &Path) -> Result<Option<ArrayMeta>> {
 
 fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
     let broken = |text: String| Error::file(path, format!("broken Zarr metadata: {text}"));
+    if value["zarr_format"].as_u64() != Some(3) {
+        return Err(broken(format!("zarr_format is {}; 3 is expected in zarr.json", value["zarr_format"])));
+    }
+    if value["fill_value"].is_null() {
+        return Err(broken("no fill_value, which every array of Zarr v3 has".to_string()));
+    }
     let shape = sizes(path, "shape", &value["shape"], None, 1)?;
     let axes = Some(shape.len());
     let name = value["data_type"].as_str().map_or_else(|| value["data_type"].to_string(), str::to_string);
