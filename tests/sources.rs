@@ -337,8 +337,7 @@ fn raw_files_of_any_order_offset_and_packing() {
     let body: Vec<u8> = (0..120).flat_map(|i| (expected(shape, 0)(i) as i32).to_be_bytes()).collect();
     let bytes = [b"seven..".to_vec(), body.clone()].concat();
     fs::write(&path, &bytes).unwrap();
-    let raw =
-        RawFormat { shape, dtype: DType::I32, big_endian: true, offset: 7, trailing_ignore: false, components: 1 };
+    let raw = RawFormat { big_endian: true, offset: 7, ..raw_format(shape, DType::I32) };
     check(&raw_input(&path, raw.clone()), 0, 0);
     // Bytes after the voxels.
     fs::write(&path, [&bytes[..], b"tail"].concat()).unwrap();
@@ -383,14 +382,7 @@ fn a_file_that_shrinks_is_an_error_not_a_crash() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("v.raw");
     fs::write(&path, vec![1u8; 1 << 20]).unwrap();
-    let raw = RawFormat {
-        shape: [16, 256, 256],
-        dtype: DType::U8,
-        big_endian: false,
-        offset: 0,
-        trailing_ignore: false,
-        components: 1,
-    };
+    let raw = raw_format([16, 256, 256], DType::U8);
     let source = Source::open(&raw_input(&path, raw)).unwrap();
     fs::write(&path, b"gone").unwrap();
     let mut out = Voxels::zeroed(DType::U8, 1 << 20);
@@ -489,8 +481,7 @@ fn released_planes_come_back_unchanged() {
     let path = folder.path().join("v.raw");
     fs::write(&path, (0..1 << 22).map(|i: u32| (i.wrapping_mul(2654435761) >> 24) as u8).collect::<Vec<_>>()).unwrap();
     let shape = [64, 256, 256];
-    let raw =
-        RawFormat { shape, dtype: DType::U8, big_endian: false, offset: 0, trailing_ignore: false, components: 1 };
+    let raw = raw_format(shape, DType::U8);
     let source = Source::open(&raw_input(&path, raw)).unwrap();
     let read = || {
         let mut out = Voxels::zeroed(DType::U8, 1 << 22);
@@ -549,9 +540,7 @@ fn an_identity_follows_the_content_not_the_place() {
 #[test]
 fn published_volumes_have_the_right_voxels() {
     let Some(folder) = shared_data() else { return };
-    let raw = |shape, dtype, big_endian| {
-        Some(RawFormat { shape, dtype, big_endian, offset: 0, trailing_ignore: false, components: 1 })
-    };
+    let raw = |shape, dtype, big_endian| Some(RawFormat { big_endian, ..raw_format(shape, dtype) });
     let volumes = [
         (
             "cthead_256x256x113_uint16be.raw.gz",

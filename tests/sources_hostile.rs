@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use common_sources::*;
 use occlude::brick::Voxels;
-use occlude::config::{Input, RawFormat, Select};
+use occlude::config::{Input, Select};
 use occlude::grid::{DType, Region};
 use occlude::store::Source;
 
@@ -430,14 +430,7 @@ fn pipes_are_no_volumes() {
     assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     let header = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 3 2\nencoding: raw\ndata file: p.raw\n";
     fs::write(folder.path().join("p.nhdr"), header).unwrap();
-    let raw = RawFormat {
-        shape: [2, 3, 4],
-        dtype: DType::U8,
-        big_endian: false,
-        offset: 0,
-        trailing_ignore: false,
-        components: 1,
-    };
+    let raw = raw_format([2, 3, 4], DType::U8);
     for input in [raw_input(&pipe, raw), file_input(&folder.path().join("p.nhdr"))] {
         let error = Source::open(&input).unwrap_err().to_string();
         assert!(error.contains("p.raw") && error.contains("neither a file nor a folder"), "{error}");

@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::args::CompareArgs;
 use super::moments::{Magnitudes, Moments};
-use super::progress::Shown;
+use super::progress::{Count, Shown};
 use super::reader::Volume;
 use super::{human, messages, usage};
 use crate::Result;
@@ -82,8 +82,7 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel, progress: &dyn Progress)
         true => 1.0,
         false => value_range(a, components, cancel, progress)?,
     };
-    let total = (components * ia.voxels()) as u64;
-    let mut done = 0;
+    let mut count = Count::new(progress, "compare", components * ia.voxels());
     let mut sums = Sums::default();
     let mut plane = [0, 1].map(|_| vec![0.0; ia.shape[1] * ia.shape[2]]);
     for component in 0..components {
@@ -97,8 +96,7 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel, progress: &dyn Progress)
             }
             sums.add(va, vb);
             similarity.push_plane(va, vb);
-            done += va.len() as u64;
-            progress.update(done, total, 0, 0, "compare");
+            count.add(va.len());
         }
         sums.similar(similarity.finish());
     }
@@ -108,17 +106,9 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel, progress: &dyn Progress)
 /// Largest minus least finite value of all components; 1 of a constant, so that equal constants are alike.
 fn value_range(volume: &Volume, components: usize, cancel: &Cancel, progress: &dyn Progress) -> Result<f64> {
     let mut all = Moments::default();
-    let total = (components * volume.info().voxels()) as u64;
-    let mut done = 0;
+    let mut count = Count::new(progress, "range of A", components * volume.info().voxels());
     for component in 0..components {
-        let mut planes = volume.planes(component)?;
-        let mut plane = vec![0.0; planes.plane_voxels()];
-        while planes.next(&mut plane)? {
-            cancel.check()?;
-            all = all.merge(Moments::of(&plane));
-            done += plane.len() as u64;
-            progress.update(done, total, 0, 0, "range of A");
-        }
+        volume.each_plane(component, cancel, &mut count, &mut |plane| all = all.merge(Moments::of(plane)))?;
     }
     let range = all.max - all.min;
     Ok(if range > 0.0 && range.is_finite() { range } else { 1.0 })

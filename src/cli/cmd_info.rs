@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::args::InfoArgs;
 use super::attributes::{self, Attributes};
 use super::moments::{Histogram, Moments};
-use super::progress::Shown;
+use super::progress::{Count, Shown};
 use super::reader::{self, Volume};
 use super::{human, messages};
 use crate::Result;
@@ -94,7 +94,8 @@ fn of_component(volume: &Volume, component: usize, cancel: &Cancel, progress: &d
     });
     let mut fine = fine;
     let mut moments = Moments::default();
-    pass(volume, component, cancel, progress, &mut |plane| {
+    let count = || Count::new(progress, "statistics", volume.info().voxels());
+    volume.each_plane(component, cancel, &mut count(), &mut |plane| {
         moments = moments.merge(Moments::of(plane));
         if let Some(fine) = &mut fine {
             fine.add(plane);
@@ -111,28 +112,9 @@ fn of_component(volume: &Volume, component: usize, cancel: &Cancel, progress: &d
                 histogram.add_times(centre, *count);
             }
         }
-        None => pass(volume, component, cancel, progress, &mut |plane| histogram.add(plane))?,
+        None => volume.each_plane(component, cancel, &mut count(), &mut |plane| histogram.add(plane))?,
     }
     Ok(Statistics { moments, histogram })
-}
-
-fn pass(
-    volume: &Volume,
-    component: usize,
-    cancel: &Cancel,
-    progress: &dyn Progress,
-    f: &mut dyn FnMut(&[f64]),
-) -> Result<()> {
-    let mut planes = volume.planes(component)?;
-    let mut plane = vec![0.0; planes.plane_voxels()];
-    let mut done = 0;
-    while planes.next(&mut plane)? {
-        cancel.check()?;
-        f(&plane);
-        done += plane.len() as u64;
-        progress.update(done, volume.info().voxels() as u64, 0, 0, "statistics");
-    }
-    Ok(())
 }
 
 fn level_json(info: &VolumeInfo) -> Value {

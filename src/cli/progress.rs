@@ -59,6 +59,25 @@ impl Shown {
     }
 }
 
+/// Voxels counted towards a total, without bricks.
+pub struct Count<'a> {
+    progress: &'a dyn Progress,
+    phase: &'static str,
+    done: u64,
+    total: u64,
+}
+
+impl<'a> Count<'a> {
+    pub fn new(progress: &'a dyn Progress, phase: &'static str, total: usize) -> Count<'a> {
+        Count { progress, phase, done: 0, total: total as u64 }
+    }
+
+    pub fn add(&mut self, voxels: usize) {
+        self.done += voxels as u64;
+        self.progress.update(self.done, self.total, 0, 0, self.phase);
+    }
+}
+
 fn bar() -> ProgressBar {
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr_with_hz(8));
     let template = "{prefix:10} {wide_bar} {percent:>3}%  {msg}";

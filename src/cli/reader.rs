@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::args::RawArgs;
 use super::attributes::{self, Attributes};
+use super::progress::Count;
 use super::{messages, usage};
 use crate::brick::Voxels;
 use crate::config::{Input, InputKind, Place, RawFormat, Select};
@@ -139,6 +140,24 @@ impl Volume {
 
     pub fn planes(&self, component: usize) -> Result<Planes<'_>> {
         Planes::new(&self.source, self.affine, component)
+    }
+
+    /// Goes through the planes of a component in order, until somebody asks to stop.
+    pub fn each_plane(
+        &self,
+        component: usize,
+        cancel: &Cancel,
+        count: &mut Count,
+        f: &mut dyn FnMut(&[f64]),
+    ) -> Result<()> {
+        let mut planes = self.planes(component)?;
+        let mut plane = vec![0.0; planes.plane_voxels()];
+        while planes.next(&mut plane)? {
+            cancel.check()?;
+            f(&plane);
+            count.add(plane.len());
+        }
+        Ok(())
     }
 }
 

@@ -29,26 +29,24 @@ pub fn convert(src: AnyView, mapping: Mapping, dst: AnyViewMut) {
 pub fn convert_at(level: Level, src: AnyView, mapping: Mapping, mut dst: AnyViewMut) {
     assert_eq!(src.shape(), dst.shape(), "conversion keeps the shape");
     let [nz, ny, _] = src.shape();
-    let rows = || (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y)));
-    if let (AnyView::F32(s), true) = (src, level > Level::Baseline && mapping.range == Some([0.0, 1.0])) {
-        let fill = Linear::new(mapping, dst.dtype()).fill;
-        match &mut dst {
-            AnyViewMut::U8(d) => {
-                return rows().for_each(|(z, y)| unit(level, s.row_at(z, y), 255.0, fill, d.row_at(z, y)));
-            }
-            AnyViewMut::U16(d) => {
-                return rows().for_each(|(z, y)| unit(level, s.row_at(z, y), 65535.0, fill, d.row_at(z, y)));
-            }
-            _ => {}
+    let rows = (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y)));
+    let fill = |dtype| Linear::new(mapping, dtype).fill;
+    let fused = level > Level::Baseline && mapping.range == Some([0.0, 1.0]);
+    match (src, &mut dst) {
+        (AnyView::F32(s), AnyViewMut::U8(d)) if fused => {
+            let fill = fill(DType::U8);
+            rows.for_each(|(z, y)| unit(level, s.row_at(z, y), 255.0, fill, d.row_at(z, y)));
         }
-    }
-    with_view!(AnyView, src, s => with_view!(AnyViewMut, &mut dst, d => {
-        for z in 0..nz {
-            for y in 0..ny {
+        (AnyView::F32(s), AnyViewMut::U16(d)) if fused => {
+            let fill = fill(DType::U16);
+            rows.for_each(|(z, y)| unit(level, s.row_at(z, y), 65535.0, fill, d.row_at(z, y)));
+        }
+        (src, dst) => with_view!(AnyView, src, s => with_view!(AnyViewMut, dst, d => {
+            for (z, y) in rows {
                 convert_row(level, s.row_at(z, y), mapping, d.row_at(z, y));
             }
-        }
-    }))
+        })),
+    }
 }
 
 /// Converts one row. Panics if the lengths differ.
@@ -141,9 +139,12 @@ fn quantise_loop<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
     }
 }
 
-/// 2^23: a fused product and this sum round once, ties to even, and leave the integer in the low bits. So single floats of openness
-/// need no f64 on the way.
-const ROUNDER_SINGLE: f32 = 8_388_608.0;
+/// Round half even of `top o` for `o` in [0, 1] and integers of up to 16 bits: a fused product and 2^23 round once, and leave the
+/// integer in the low bits. So single floats of openness need no f64 on the way.
+#[inline(always)]
+pub fn unit_code(o: f32, top: f32) -> u32 {
+    o.mul_add(top, 8_388_608.0).to_bits() & 0xffff
+}
 
 #[inline(always)]
 fn unit_inner<D: Output>(src: &[f32], top: f32, fill: f64, dst: &mut [D]) {
@@ -152,8 +153,7 @@ fn unit_inner<D: Output>(src: &[f32], top: f32, fill: f64, dst: &mut [D]) {
         // NaN becomes 0 here.
         let v = if *s > 0.0 { *s } else { 0.0 };
         let v = if v < 1.0 { v } else { 1.0 };
-        let code = v.mul_add(top, ROUNDER_SINGLE).to_bits();
-        *d = D::from_low_bits(if s.is_nan() { fill } else { code } as u64);
+        *d = D::from_low_bits(if s.is_nan() { fill } else { unit_code(v, top) } as u64);
     }
 }
 

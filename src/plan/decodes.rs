@@ -18,7 +18,7 @@ const MOST_DECODES: f64 = 3.0;
 const MOST_VISITS: usize = 1 << 18;
 
 /// Tasks along an axis that are looked at, a power of two.
-const MOST_TASKS: usize = 64;
+const MOST_ALONG: usize = 64;
 
 /// Times that a sweep which reads while it runs is taken to go through all that it sees: one for some of its directions.
 const SWEEP_PASSES: usize = 8;
@@ -88,7 +88,7 @@ fn visits(group: &Group, inputs: &[Chunked]) -> (Vec<u32>, Vec<usize>) {
     let (mut numbers, mut of, mut visits) = (HashMap::new(), Vec::new(), Vec::new());
     let [_, ny, nx] = group.tasks;
     // The first along the curve, whatever the volume's size.
-    let first = Region::whole(group.tasks.map(|n| n.min(MOST_TASKS)));
+    let first = Region::whole(group.tasks.map(|n| n.min(MOST_ALONG)));
     let mut tasks: Vec<[i64; 3]> = first.iter().collect();
     tasks.sort_by_key(|t| morton(*t));
     let number = |[z, y, x]: [i64; 3]| (z as usize * ny + y as usize) * nx + x as usize;

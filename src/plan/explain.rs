@@ -295,7 +295,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         "groups": groups,
         "outputs": outputs,
         "placement": plan.placement.iter().map(|(n, d, _)| (n.clone(), json!(d))).collect::<serde_json::Map<_, _>>(),
-        "peak_memory_bytes": plan.groups.iter().map(|g| &g.brick).chain(&plan.over_all).map(|b| b.peak(plan.workers)).max(),
+        "peak_memory_bytes": plan.groups.iter().flat_map(|g| [&g.brick].into_iter().chain(&g.prepass)).map(|b| b.peak(plan.workers)).max(),
         "memory_budget_bytes": plan.memory,
         "scratch_bytes": scratch(plan, sources),
         "read_amplification": plan.groups.iter().map(|g| g.brick.amplification).fold(0.0, f64::max),

@@ -63,8 +63,6 @@ pub struct Plan {
     pub outputs: Vec<OutputPlan>,
     /// Outputs on lattices of one shape share bricks and tasks.
     pub groups: Vec<Group>,
-    /// Bricks of pre-passes over the volume of each group; empty without pre-passes.
-    pub over_all: Vec<BrickChoice>,
     pub threads: usize,
     /// Threads that compute bricks: `threads`, or as many as keep the GPU's slots busy, where most of them wait.
     pub workers: usize,
@@ -106,7 +104,6 @@ impl Plan {
         warnings.extend(fills::warnings(config, &graph));
         let mut plan = Plan {
             groups: Vec::new(),
-            over_all: Vec::new(),
             prepasses: lowered.prepasses,
             outputs,
             graph,
@@ -128,7 +125,8 @@ impl Plan {
         streams::choose(&mut plan, config)?;
         fits::settle(&mut plan);
         if !plan.prepasses.is_empty() {
-            plan.over_all = plan.groups.iter().map(|g| brick::over_all(&plan, g, config)).collect();
+            let bricks: Vec<_> = plan.groups.iter().map(|g| brick::over_all(&plan, g, config)).collect();
+            plan.groups.iter_mut().zip(bricks).for_each(|(group, brick)| group.prepass = Some(brick));
         }
         Ok(plan)
     }

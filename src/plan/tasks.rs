@@ -50,6 +50,8 @@ pub struct Group {
     /// Number of the group's first task.
     pub first_task: usize,
     pub brick: BrickChoice,
+    /// Bricks of pre-passes, which go over the whole volume; `None` where there is none.
+    pub prepass: Option<BrickChoice>,
 }
 
 /// One super-block.
@@ -190,6 +192,7 @@ pub fn groups(plan: &Plan) -> Vec<Group> {
                 tasks: [1; 3],
                 first_task: 0,
                 brick: BrickChoice::default(),
+                prepass: None,
             });
             groups.len() - 1
         });

@@ -306,6 +306,11 @@ impl Assembler<'_> {
     ) -> Result<()> {
         let (output, sink) = (place.output, &place.target.sink);
         let dataset = k - output.first_level();
+        let mut push = |region: Region, voxels: AnyView| -> Result<()> {
+            let chunk = sink.encode(dataset, region, voxels)?;
+            items.push(Item { output: place.index, dataset, component: place.component, region, chunk });
+            Ok(())
+        };
         let whole = Region::whole(output.level(k).expect("level exists").shape);
         for index in region.cells([0; 3], output.spec.chunk).iter() {
             let chunk = Region::of_cell(index, [0; 3], output.spec.chunk).clip(&whole);
@@ -313,24 +318,13 @@ impl Assembler<'_> {
             let piece = view.part(region.offset_of(&part), part.shape());
             let converted = mapping.map(|m| self.converted(place, piece, m));
             let piece = converted.as_ref().map_or(piece, |c| c.view(part.shape()));
-            let encoded = if part == chunk {
-                Some(sink.encode(dataset, chunk, piece)?)
+            if part == chunk {
+                push(chunk, piece)?;
             } else if let Some(full) = self.park(place, (place.index, k, place.component, index), chunk, part, piece) {
-                let encoded = sink.encode(dataset, chunk, full.view(chunk.shape()))?;
+                push(chunk, full.view(chunk.shape()))?;
                 self.pool.put(full);
-                Some(encoded)
-            } else {
-                None
-            };
+            }
             converted.into_iter().for_each(|c| self.pool.put(c));
-            let item = |chunk_bytes| Item {
-                output: place.index,
-                dataset,
-                component: place.component,
-                region: chunk,
-                chunk: chunk_bytes,
-            };
-            items.extend(encoded.map(item));
         }
         Ok(())
     }

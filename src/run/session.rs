@@ -28,7 +28,7 @@ use crate::gpu::Gpu;
 use crate::grid::{Region, order::morton};
 use crate::plan::{BrickChoice, Group, Plan, decodes};
 use crate::store::sink::{Claim, Sink};
-use crate::store::{Source, VolumeInfo, open_inputs, read_of, said_of};
+use crate::store::{Source, VolumeInfo, changed_by, named_files, open_inputs, said_of};
 use crate::{Error, Result};
 
 /// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
@@ -68,8 +68,9 @@ impl<'a> Session<'a> {
     /// Plans, unpacks inputs where needed, runs the pre-passes, opens the outputs.
     pub fn open(config: &'a Config, options: &'a RunOptions, progress: &'a dyn Progress) -> Result<Session<'a>> {
         let sources = open_inputs(config)?;
+        let named = named_files(config, &sources);
         for path in [&options.trace, &options.report].into_iter().flatten() {
-            if let Some(file) = read_of(&sources, path) {
+            if let Some(file) = changed_by(&named, path) {
                 let message = format!(
                     "would be written over {}, which is read for an input; expected another file",
                     file.display()
@@ -346,8 +347,8 @@ impl<'a> Session<'a> {
     fn prepass(&self, id: usize) -> Result<Vec<f64>> {
         let prepass = &self.plan.prepasses[id];
         let lattice = &self.plan.graph.lattices[self.plan.graph.wires[prepass.wires[0]].lattice];
-        let group = self.plan.groups.iter().position(|g| g.shape == lattice.shape).unwrap_or(0);
-        let brick = &self.plan.over_all[group];
+        let group = self.plan.groups.iter().find(|g| g.shape == lattice.shape).unwrap_or(&self.plan.groups[0]);
+        let brick = group.prepass.as_ref().unwrap_or(&group.brick);
         let program = Program::of_prepass(&self.plan, prepass, lattice.shape);
         let engine = self.engine();
         let whole = Region::whole(lattice.shape);

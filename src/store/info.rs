@@ -42,6 +42,11 @@ pub struct Orientation {
 }
 
 impl Orientation {
+    /// From voxel to voxel along a column's axis (0: x).
+    pub fn step(&self, column: usize) -> f64 {
+        self.matrix.iter().map(|row| row[column] * row[column]).sum::<f64>().sqrt()
+    }
+
     /// Origin `[z, y, x]` where the matrix is diagonal and positive (to rounding).
     pub fn straight_origin(&self) -> Option<[f64; 3]> {
         let m = &self.matrix;

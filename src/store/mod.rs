@@ -12,7 +12,7 @@ pub mod spill;
 
 pub use info::VolumeInfo;
 pub use layout::{LevelLayout, Pyramid};
-pub use open::{open_inputs, read_of, said_of};
+pub use open::{changed_by, named_files, open_inputs, said_of};
 pub use sink::{Sink, SinkSpec};
 pub use source::Source;
 pub use spill::Spill;

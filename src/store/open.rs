@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use super::Source;
-use crate::config::Config;
 use crate::config::check::resolved;
+use crate::config::{Config, Input, InputKind};
 use crate::{Error, Result};
 
 /// Opens the config's inputs in order, for a run within its budget: headers only. Errors name the line of the key.
@@ -18,8 +18,9 @@ pub fn open_inputs(config: &Config) -> Result<Vec<Source>> {
         Ok(source)
     };
     let sources = config.inputs.iter().map(open).collect::<Result<Vec<_>>>()?;
+    let named = named_files(config, &sources);
     for output in &config.outputs {
-        if let Some(file) = read_of(&sources, &output.path) {
+        if let Some(file) = changed_by(&named, &output.path) {
             let (path, file) = (&output.path, file.display());
             let message = format!("got {path:?}; {file} is read for an input; expected another path");
             return Err(config.locate(Error::config(format!("output.{}.path", output.name), message)));
@@ -28,14 +29,20 @@ pub fn open_inputs(config: &Config) -> Result<Vec<Source>> {
     Ok(sources)
 }
 
-/// The file or folder of these volumes that writing to `path` would change.
-pub fn read_of(sources: &[Source], path: &Path) -> Option<PathBuf> {
-    let target = resolved(path);
-    let hit = |file: &PathBuf| {
-        let real = resolved(file);
-        target.starts_with(&real) || real.starts_with(&target)
+/// Files that headers name, links followed: they are read, too, and the config does not tell. What it tells is checked before
+/// anything is opened, and slices of a folder may be many.
+pub fn named_files(config: &Config, sources: &[Source]) -> Vec<PathBuf> {
+    let beside = |(input, source): (&Input, &Source)| {
+        let InputKind::Path { path, .. } = &input.kind else { return Vec::new() };
+        source.paths().into_iter().filter(|file| !file.starts_with(path)).map(|file| resolved(&file)).collect()
     };
-    sources.iter().flat_map(Source::paths).find(hit)
+    config.inputs.iter().zip(sources).flat_map(beside).collect()
+}
+
+/// The one of [`named_files`] that writing to `path` would change.
+pub fn changed_by<'a>(named: &'a [PathBuf], path: &Path) -> Option<&'a PathBuf> {
+    let target = resolved(path);
+    named.iter().find(|file| target.starts_with(file) || file.starts_with(&target))
 }
 
 /// An error of opening or unpacking an input with the place in the config that names the file.

@@ -35,6 +35,11 @@ pub fn file_input(path: &Path) -> Input {
     }
 }
 
+/// Little-endian voxels and nothing else.
+pub fn raw_format(shape: [usize; 3], dtype: DType) -> RawFormat {
+    RawFormat { shape, dtype, big_endian: false, offset: 0, trailing_ignore: false, components: 1 }
+}
+
 pub fn raw_input(path: &Path, raw: RawFormat) -> Input {
     Input { kind: InputKind::Path { path: path.to_path_buf(), raw: Some(raw) }, ..file_input(path) }
 }

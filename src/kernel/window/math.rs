@@ -1,6 +1,8 @@
 //! Polynomials of the estimators. Only IEEE operations and explicit fused multiply-adds, so that every instruction set
 //! (and the shaders) computes the same bits. The coefficients are minimax fits of relative error, made for this project.
 
+use crate::kernel::convert::unit_code;
+
 /// `2^x` for `x <= 0`, relative error 1e-7; anything below -125 gives about 2e-38.
 #[inline(always)]
 pub fn exp2(x: f32) -> f32 {
@@ -100,8 +102,7 @@ pub fn phi(z: f32) -> f32 {
 /// Round half even of `255 o` for `o` in [0, 1].
 #[inline(always)]
 pub fn quantise(o: f32) -> u8 {
-    const MAGIC: f32 = 8_388_608.0; // 2^23
-    (255f32.mul_add(o, MAGIC).to_bits() & 0xff) as u8
+    unit_code(o, 255.0) as u8
 }
 
 #[cfg(test)]

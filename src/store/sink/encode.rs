@@ -73,7 +73,9 @@ impl Encoder {
                 return Ok(Encoded::Empty);
             }
             let size = voxels.dtype().size();
-            if let (Some(bytes), true) = (whole(v, chunk), self.codec != Codec::None) {
+            if self.codec != Codec::None
+                && let Some(bytes) = whole(v, chunk)
+            {
                 return self.compress(bytes, size).map(Encoded::Bytes);
             }
             let mut raw = self.buffer();

@@ -75,7 +75,7 @@ impl SinkSpec {
         let m = orientation.matrix;
         let mut out = m;
         for a in 0..3 {
-            let (zyx, norm) = (2 - a, (0..3).map(|r| m[r][a] * m[r][a]).sum::<f64>().sqrt());
+            let (zyx, norm) = (2 - a, orientation.step(a));
             // The spacing of the configuration may differ from the file's; equal ones keep their digits.
             let factor = level.factor[zyx] as f64;
             let given = level.scale[zyx] / factor;

@@ -190,7 +190,7 @@ fn follow_matrix(info: &mut VolumeInfo, axes: usize) {
     let Some(orientation) = &info.orientation else { return };
     let written = info.spacing;
     for column in 0..axes.min(3) {
-        let length = (0..3).map(|r| orientation.matrix[r][column].powi(2)).sum::<f64>().sqrt();
+        let length = orientation.step(column);
         let own = &mut info.spacing[2 - column];
         // Headers hold both as f32, a quaternion with fewer digits still.
         if length.is_normal() && (length / *own - 1.0).abs() > 1e-4 {

@@ -34,10 +34,9 @@ pub fn open_raw(input: &Input, path: &Path, raw: &RawFormat) -> Result<Parsed> {
     };
     let packed = start == [0x1f, 0x8b] && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("gz"));
     let (lattice, pending) = if packed {
-        let len = all;
         lattice(raw.offset)?;
         let (path, trailing_ignore) = (path.to_path_buf(), raw.trailing_ignore);
-        let packed = Packed { path, packing: Packing::Gzip, start: 0, skip: raw.offset, len, trailing_ignore };
+        let packed = Packed { path, packing: Packing::Gzip, start: 0, skip: raw.offset, len: all, trailing_ignore };
         (lattice(0)?, Pending::Unpack(packed))
     } else {
         (lattice(raw.offset)?, Pending::Nothing)
