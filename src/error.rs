@@ -21,6 +21,8 @@ pub enum Error {
     },
     /// A file that cannot be read, written or understood (exit code 1).
     File { path: PathBuf, message: String },
+    /// A GPU that was asked for and is not there (exit code 1): the config is right where there is one.
+    NoDevice(String),
     /// The run failed for another reason (exit code 1).
     Failed(String),
     /// Stopped on request; what was finished is kept (exit code 130).
@@ -53,7 +55,7 @@ impl Error {
     pub fn exit_code(&self) -> i32 {
         match self {
             Error::Config { .. } => 2,
-            Error::File { .. } | Error::Failed(_) => 1,
+            Error::File { .. } | Error::NoDevice(_) | Error::Failed(_) => 1,
             Error::Interrupted => 130,
         }
     }
@@ -80,8 +82,8 @@ impl fmt::Display for Error {
                 write!(f, ": {message}")
             }
             Error::File { path, message } => write!(f, "{}: {message}", path.display()),
-            Error::Failed(message) => f.write_str(message),
-            Error::Interrupted => f.write_str("interrupted; finished tasks are kept, --resume goes on with the rest"),
+            Error::NoDevice(message) | Error::Failed(message) => f.write_str(message),
+            Error::Interrupted => f.write_str("interrupted"),
         }
     }
 }

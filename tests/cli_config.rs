@@ -633,4 +633,20 @@ fn the_schema_refuses_what_the_parser_refuses() {
         assert!(check(&text).is_err() && read(&text).is_err(), "{text}");
     }
     assert!(check("[run]\n").is_err());
+    // Two names of one key: one of them.
+    let combine = |keys: &str| {
+        format!(
+            "[input.a]\npath = \"a.npy\"\n[stage.s]\nop = \"combine\"\nop_kind = \"add\"\n{keys}[output.o]\npath = \"o.npy\"\n\
+             from = \"s\"\n"
+        )
+    };
+    for (keys, fits) in [
+        ("input = [\"a\", \"a\"]\n", true),
+        ("inputs = [\"a\", \"a\"]\n", true),
+        ("", false),
+        ("input = [\"a\", \"a\"]\ninputs = [\"a\", \"a\"]\n", false),
+    ] {
+        let text = combine(keys);
+        assert_eq!((check(&text).is_ok(), read(&text).is_ok()), (fits, fits), "{text}");
+    }
 }

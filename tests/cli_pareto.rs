@@ -123,7 +123,7 @@ fn a_large_volume_is_judged_on_bricks_whatever_the_run_is_cut_into() {
     assert!(number(&row["surface_band"], "n") <= 0.2 * n && number(&row["windows_that_vary"], "n") <= n);
     // The kept truth shows where it was computed, and where nothing was: there it holds the fill.
     let values = |name: &str| -> Vec<f64> {
-        let decoded = common::decode(&folder.path().join("pareto").join(name));
+        let decoded = common::decode(&folder.path().join("pareto/volumes").join(name));
         decoded["level 0 component 0"].1.iter().map(|bits| f64::from_bits(*bits)).collect()
     };
     let (truth, run) = (values("reference0.zarr"), values("run0.zarr"));

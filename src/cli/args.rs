@@ -236,7 +236,7 @@ pub struct ParetoArgs {
     #[command(flatten)]
     pub config: ConfigArgs,
     /// Name the cheapest combination whose rmse (over all voxels) is at most this, and the config lines for it
-    #[arg(long, value_name = "RMSE")]
+    #[arg(long, value_name = "RMSE", value_parser = bound)]
     pub max_error: Option<f64>,
     /// Print the table as JSON
     #[arg(long)]

@@ -83,6 +83,15 @@ impl Attributes {
         })
     }
 
+    /// Voxel size of level 0 and its unit.
+    pub fn spacing(&self) -> Option<([f64; 3], Option<String>)> {
+        let occlude = self.occlude.as_ref()?;
+        let sizes: Vec<f64> = occlude.get("spacing")?.as_array()?.iter().filter_map(Value::as_f64).collect();
+        let sizes: [f64; 3] = sizes.try_into().ok()?;
+        let unit = occlude.get("units").and_then(Value::as_str).map(String::from);
+        sizes.iter().all(|s| s.is_finite() && *s > 0.0).then_some((sizes, unit))
+    }
+
     /// `Some(false)`: an output that was not finished.
     pub fn complete(&self) -> Option<bool> {
         let occlude = self.occlude.as_ref()?;
@@ -109,6 +118,8 @@ mod tests {
         put("b.zarr/.zattrs", &json!({"occlude": occlude, "multiscales": multiscales}));
         put("c.nii.occlude/meta.json", &occlude);
         put("d.nii.occlude/meta.json", &json!({"occlude": occlude, "shape": [1, 2, 3], "dtype": "u8"}));
+        put("g.raw.occlude/meta.json", &json!({"occlude": {"spacing": [2.0, 1.0, 0.5], "units": "millimeter"}}));
+        put("h.raw.occlude/meta.json", &json!({"occlude": {"spacing": [2.0, 0.0, 0.5]}}));
         put("f.raw.occlude/meta.json", &json!({"occlude": occlude, "shape": [7, 1, 2, 3], "dtype": "f32"}));
         for (name, levels) in [("a.zarr", 2), ("b.zarr", 2), ("c.nii", 0), ("d.nii", 0)] {
             let a = read(&folder.path().join(name));
@@ -116,6 +127,9 @@ mod tests {
             assert!(a.is_openness() && a.complete() == Some(true), "{name}");
             assert_eq!(a.datasets.len(), levels, "{name}");
         }
+        let spacing = |name: &str| read(&folder.path().join(name)).spacing();
+        assert_eq!(spacing("g.raw"), Some(([2.0, 1.0, 0.5], Some("millimeter".to_string()))));
+        assert_eq!((spacing("h.raw"), spacing("d.nii")), (None, None));
         let d = read(&folder.path().join("d.nii"));
         assert_eq!((d.shape, d.dtype, d.components), (Some([1, 2, 3]), Some(DType::U8), None));
         let f = read(&folder.path().join("f.raw"));

@@ -110,8 +110,7 @@ fn value_range(volume: &Volume, components: usize, cancel: &Cancel, progress: &d
     for component in 0..components {
         volume.each_plane(component, cancel, &mut count, &mut |plane| all = all.merge(Moments::of(plane)))?;
     }
-    let range = all.max - all.min;
-    Ok(if range > 0.0 && range.is_finite() { range } else { 1.0 })
+    Ok(all.dynamic_range())
 }
 
 /// Running sums over pairs.
@@ -166,7 +165,8 @@ impl Sums {
             mae: mean(self.absolute),
             bias: if self.signed.infinite > 0 || n == 0 { f64::NAN } else { self.signed.mean },
             max_abs: if n == 0 { f64::NAN } else { self.max_abs },
-            p99: self.magnitudes.quantile(0.99),
+            // Magnitudes are kept as f32, which rounds.
+            p99: self.magnitudes.quantile(0.99).min(self.max_abs),
             ssim: (self.similarity.1 > 0).then(|| self.similarity.0 / self.similarity.1 as f64),
             n,
             missing: self.missing,

@@ -4,7 +4,7 @@ use super::args::RunArgs;
 use super::progress::Shown;
 use super::{can_write, human, load, messages, refuse_overwriting, usage, write_whole};
 use crate::config::InputKind;
-use crate::config::check::resolved;
+use crate::config::check::{resolved, work_folder};
 use crate::run::{self, Report, RunOptions};
 use crate::{Error, Result};
 
@@ -24,7 +24,8 @@ pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
         });
         refuse_overwriting(flag, path, inputs.chain([config.file.as_path()]))?;
         let real = resolved(path);
-        if let Some(o) = config.outputs.iter().find(|o| real.starts_with(resolved(&o.path))) {
+        let writes = |p: &std::path::Path| real.starts_with(resolved(p)) || real.starts_with(resolved(&work_folder(p)));
+        if let Some(o) = config.outputs.iter().find(|o| writes(&o.path)) {
             let message = format!("got {}, which output {:?} writes; expected another file", path.display(), o.name);
             return Err(usage(flag, message));
         }

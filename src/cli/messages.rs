@@ -2,15 +2,16 @@
 
 use std::io::Write;
 use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use tracing_subscriber::EnvFilter;
 
 use crate::Error;
 use crate::run::Cancel;
 
-/// Prints an error.
-pub fn error(e: &Error) {
-    let _ = writeln!(std::io::stderr(), "error: {e}");
+/// Prints an error, and what a user can do after it.
+pub fn error(e: &Error, then: &str) {
+    let _ = writeln!(std::io::stderr(), "error: {e}{then}");
 }
 
 /// Prints a line for people.
@@ -18,8 +19,14 @@ pub fn note(text: &str) {
     let _ = writeln!(std::io::stderr(), "{text}");
 }
 
-/// Prints something that a user should know, but need not act on.
+/// Whether only errors are printed.
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Prints something that a user should know, but need not act on; nothing with `-q`.
 pub fn warning(text: &str) {
+    if QUIET.load(Ordering::Relaxed) {
+        return;
+    }
     let _ = writeln!(std::io::stderr(), "warning: {text}");
 }
 
@@ -38,6 +45,7 @@ pub fn hook_panics(verbose: bool) {
 
 /// Logs to stderr: warnings by default, nothing but errors with `-q`, more with each `-v`.
 pub fn start_logs(quiet: bool, verbose: u8) {
+    QUIET.store(quiet, Ordering::Relaxed);
     let level = match (quiet, verbose) {
         (true, _) => "error",
         (_, 0) => "warn",
@@ -52,6 +60,7 @@ pub fn start_logs(quiet: bool, verbose: u8) {
         .without_time()
         .with_target(verbose > 1)
         .with_ansi(false)
+        .log_internal_errors(false)
         .try_init();
 }
 
@@ -70,30 +79,59 @@ pub fn interrupts() -> Cancel {
                 let text = "stopping after the bricks in hand; interrupt again to stop at once";
                 let _ = writeln!(std::io::stderr(), "{text}");
             };
+            let ignored = ignored_signals();
             // Without a handler Ctrl-C still ends the process, only less gently.
             let _ = ctrlc::set_handler(handler);
+            ignored.into_iter().for_each(ignore_signal);
             token
         })
         .clone()
 }
 
-/// Ends quietly when the reader of stdout goes away (`occlude plan | head`), like other command-line programs; a limit of file
-/// sizes (`ulimit -f`) is an error of the write that exceeds it, not the end of the process.
-pub fn set_signals() {
+/// Signals that would stop a run and that whoever started it had ignored (`nohup`, a shell's background job): they stay so.
+fn ignored_signals() -> Vec<i32> {
     #[cfg(unix)]
-    // SAFETY: called once at the start, before any thread; both are valid dispositions.
-    unsafe {
-        libc::signal(libc::SIGPIPE, libc::SIG_DFL);
-        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
+    {
+        let is_ignored = |signal: &i32| {
+            // SAFETY: zeroes are a valid `sigaction`, and with no new action the call only fills it in.
+            unsafe {
+                let mut now: libc::sigaction = std::mem::zeroed();
+                libc::sigaction(*signal, std::ptr::null(), &mut now) == 0 && now.sa_sigaction == libc::SIG_IGN
+            }
+        };
+        [libc::SIGINT, libc::SIGTERM, libc::SIGHUP].into_iter().filter(is_ignored).collect()
     }
+    #[cfg(not(unix))]
+    Vec::new()
 }
 
-/// Writes a result to stdout.
+fn ignore_signal(signal: i32) {
+    #[cfg(unix)]
+    // SAFETY: a valid disposition of a signal that exists.
+    unsafe {
+        libc::signal(signal, libc::SIG_IGN);
+    }
+    let _ = signal;
+}
+
+/// A limit of file sizes (`ulimit -f`) is an error of the write that exceeds it, not the end of the process. That readers of stdout
+/// or stderr go away is an error, too (Rust ignores SIGPIPE), so that a run goes on.
+pub fn set_signals() {
+    #[cfg(unix)]
+    ignore_signal(libc::SIGXFSZ);
+}
+
+/// Writes a result to stdout. That its reader has seen enough (`occlude plan | head`) is no error.
 pub fn result(text: &str) -> crate::Result<()> {
     let mut out = std::io::stdout().lock();
     let end = if text.ends_with('\n') { "" } else { "\n" };
     let written = write!(out, "{text}{end}").and_then(|()| out.flush());
-    written.map_err(|e| Error::Failed(format!("cannot write to stdout: {e}")))
+    match written {
+        Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Error::Failed(format!("cannot write to stdout: {e}")))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Writes JSON to stdout.

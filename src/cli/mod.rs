@@ -43,7 +43,8 @@ pub fn main() -> ExitCode {
     match outcome {
         Ok(Ok(code)) => code,
         Ok(Err(e)) => {
-            messages::error(&e);
+            let goes_on = matches!((&e, &cli.command), (Error::Interrupted, Command::Run(_)));
+            messages::error(&e, if goes_on { "; finished tasks are kept, --resume goes on with the rest" } else { "" });
             ExitCode::from(e.exit_code() as u8)
         }
         // The hook has said what there is to say.
@@ -111,16 +112,23 @@ fn refuse_overwriting<'a>(flag: &str, out: &Path, read: impl IntoIterator<Item =
     }
 }
 
-/// The name under which [`write_whole`] writes first.
-fn temporary(path: &Path) -> Result<PathBuf> {
-    let mut name = path.file_name().ok_or_else(|| Error::file(path, "is not a file name"))?.to_os_string();
+/// What a result is written to: a file under a temporary name that then takes its place, wherever a link leads; a device or pipe
+/// as it is.
+fn place_of(path: &Path) -> Result<(PathBuf, Option<PathBuf>)> {
+    let target = match std::fs::metadata(path) {
+        Ok(m) if !m.is_file() && !m.is_dir() => return Ok((path.to_path_buf(), None)),
+        Ok(_) => path.canonicalize().map_err(|e| Error::file(path, format!("cannot write: {e}")))?,
+        Err(_) => path.to_path_buf(),
+    };
+    let mut name = target.file_name().ok_or_else(|| Error::file(path, "is not a file name"))?.to_os_string();
     name.push(format!(".{}.tmp", std::process::id()));
-    Ok(path.with_file_name(name))
+    let temporary = target.with_file_name(name);
+    Ok((target, Some(temporary)))
 }
 
 /// Whether a file can be made there, which is better known before hours of work than after.
 fn can_write(path: &Path) -> Result<()> {
-    let temporary = temporary(path)?;
+    let (_, Some(temporary)) = place_of(path)? else { return Ok(()) };
     let made = std::fs::File::create(&temporary);
     let _ = std::fs::remove_file(&temporary);
     made.map(drop).map_err(|e| Error::file(path, format!("cannot write: {e}")))
@@ -128,9 +136,45 @@ fn can_write(path: &Path) -> Result<()> {
 
 /// Writes a file under a temporary name first, so that no reader sees half of it.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let temporary = temporary(path)?;
-    std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, path)).map_err(|e| {
-        let _ = std::fs::remove_file(&temporary);
+    let (target, temporary) = place_of(path)?;
+    let written = match &temporary {
+        None => std::fs::write(&target, bytes),
+        Some(temporary) => std::fs::write(temporary, bytes).and_then(|()| std::fs::rename(temporary, &target)),
+    };
+    written.map_err(|e| {
+        temporary.iter().for_each(|t| drop(std::fs::remove_file(t)));
         Error::file(path, format!("cannot write: {e}"))
     })
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn links_are_followed_and_pipes_stay_pipes() {
+        use std::os::unix::fs::{FileTypeExt, symlink};
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        std::fs::create_dir(at("far")).unwrap();
+        std::fs::write(at("far/real.json"), "old").unwrap();
+        symlink(at("far/real.json"), at("link.json")).unwrap();
+        can_write(&at("link.json")).unwrap();
+        write_whole(&at("link.json"), b"new").unwrap();
+        assert_eq!(std::fs::read(at("far/real.json")).unwrap(), b"new");
+        assert!(std::fs::symlink_metadata(at("link.json")).unwrap().is_symlink());
+        let pipe = at("pipe");
+        let path = std::ffi::CString::new(pipe.to_str().unwrap()).unwrap();
+        // SAFETY: a path that ends in 0.
+        assert_eq!(unsafe { libc::mkfifo(path.as_ptr(), 0o600) }, 0);
+        can_write(&pipe).unwrap();
+        let reader = {
+            let pipe = pipe.clone();
+            std::thread::spawn(move || std::fs::read(pipe).unwrap())
+        };
+        write_whole(&pipe, b"through").unwrap();
+        assert_eq!(reader.join().unwrap(), b"through");
+        assert!(std::fs::metadata(&pipe).unwrap().file_type().is_fifo());
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 3, "nothing temporary is left");
+    }
 }

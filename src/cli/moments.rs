@@ -23,6 +23,12 @@ impl Default for Moments {
 }
 
 impl Moments {
+    /// Largest minus least finite value, for SSIM; 1 of a constant, so that equal constants are alike.
+    pub fn dynamic_range(&self) -> f64 {
+        let range = self.finite[1] - self.finite[0];
+        if range > 0.0 && range.is_finite() { range } else { 1.0 }
+    }
+
     /// Of one block, in two passes over it. Infinite values enter min and max only.
     pub fn of(values: &[f64]) -> Moments {
         let mut m = Moments::default();

@@ -20,23 +20,27 @@ const MARGIN: [f64; 4] = [80.0, 220.0, 48.0, 56.0];
 /// Okabe and Ito's colours, told apart by everyone.
 const COLOURS: [&str; 7] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000"];
 
-/// Logarithmic axis; values at or below 0 stand at its lower end.
+/// Logarithmic axis; values at or below 0 stand at its lower end, which is then marked as 0.
 struct Axis {
     lo: f64,
     hi: f64,
+    /// Whether something stands there, and whether nothing stands elsewhere.
+    zero: bool,
+    empty: bool,
 }
 
 impl Axis {
     fn of(values: impl Iterator<Item = f64> + Clone) -> Axis {
+        let zero = values.clone().any(|v| v <= 0.0);
         let positive = values.filter(|v| *v > 0.0 && v.is_finite());
         let lo = positive.clone().fold(f64::INFINITY, f64::min);
         let hi = positive.fold(0.0, f64::max);
         if lo > hi {
-            return Axis { lo: -1.0, hi: 1.0 };
+            return Axis { lo: -1.0, hi: 1.0, zero, empty: true };
         }
         let (lo, hi) = (lo.log10(), hi.log10());
         let pad = ((hi - lo) * 0.08).max(0.15);
-        Axis { lo: lo - pad, hi: hi + pad }
+        Axis { lo: lo - pad, hi: hi + pad, zero, empty: false }
     }
 
     /// 0 to 1 along the axis.
@@ -44,13 +48,20 @@ impl Axis {
         if v > 0.0 { ((v.log10() - self.lo) / (self.hi - self.lo)).clamp(0.0, 1.0) } else { 0.0 }
     }
 
-    /// 1, 2 and 5 times powers of ten inside.
+    /// 0 where something stands there, and 1, 2 and 5 times powers of ten inside.
     fn ticks(&self) -> Vec<f64> {
+        let mut ticks = if self.zero { vec![0.0] } else { Vec::new() };
+        if self.empty {
+            return ticks;
+        }
         let powers = self.lo.floor() as i32..=self.hi.ceil() as i32;
         let wide = self.hi - self.lo > 4.0;
         let steps: &[f64] = if wide { &[1.0] } else { &[1.0, 2.0, 5.0] };
         let all = powers.flat_map(|p| steps.iter().map(move |s| s * 10f64.powi(p)));
-        all.filter(|t| (self.lo..=self.hi).contains(&t.log10())).collect()
+        // Numbers beside that of 0 would run into it.
+        let least = self.lo + if self.zero { 0.04 * (self.hi - self.lo) } else { 0.0 };
+        ticks.extend(all.filter(|t| (least..=self.hi).contains(&t.log10())));
+        ticks
     }
 }
 
@@ -156,6 +167,7 @@ mod tests {
         let text = svg("t", "x", "y", &points);
         assert_eq!(text.matches("<circle").count(), 4);
         assert!(text.contains("p &amp; q") && text.contains("a&lt;b") && !text.contains("NaN"));
+        assert_eq!(text.matches(">0</text>").count(), 1, "an error of 0 has a tick of its own");
         assert!(svg("t", "x", "y", &[]).ends_with("</svg>\n"));
         let one = [point("o", [2.0, 2.0], true)];
         assert!(!svg("t", "x", "y", &one).contains("NaN"));

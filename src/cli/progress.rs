@@ -85,14 +85,18 @@ fn bar() -> ProgressBar {
     bar
 }
 
-/// `rate, ETA` from the voxels done since the phase began.
-fn pace(done: u64, total: u64, seconds: f64) -> String {
+/// `rate, ETA` from the voxels (unpacking: bytes) done since the phase began.
+fn pace(done: u64, total: u64, seconds: f64, phase: &str) -> String {
     if done == 0 || seconds <= 0.0 {
         return "starting".into();
     }
     let rate = done as f64 / seconds;
     let eta = total.saturating_sub(done) as f64 / rate;
-    format!("{} voxels/s, {} left", human::count(rate), human::seconds(eta))
+    let rate = match phase {
+        "unpack" => format!("{}/s", human::bytes(rate as u64)),
+        _ => format!("{} voxels/s", human::count(rate)),
+    };
+    format!("{rate}, {} left", human::seconds(eta))
 }
 
 impl Progress for Shown {
@@ -108,7 +112,7 @@ impl Progress for Shown {
         }
         let (since, at_start) = state.phase_start.unwrap_or((self.start, 0));
         let fresh = done.saturating_sub(at_start);
-        let pace = pace(fresh, total.saturating_sub(at_start), now.duration_since(since).as_secs_f64());
+        let pace = pace(fresh, total.saturating_sub(at_start), now.duration_since(since).as_secs_f64(), phase);
         let counted = if bricks_total == 0 { String::new() } else { format!("{bricks}/{bricks_total} bricks, ") };
         match &self.style {
             Style::Quiet => {}
@@ -120,7 +124,8 @@ impl Progress for Shown {
             }
             Style::Lines => {
                 let finished = total > 0 && done >= total;
-                if state.last_line.is_some_and(|t| now.duration_since(t) < EVERY)
+                if fresh == 0
+                    || state.last_line.is_some_and(|t| now.duration_since(t) < EVERY)
                     || (finished && state.last_line.is_none())
                 {
                     return;
@@ -149,8 +154,9 @@ impl Progress for Shown {
 mod tests {
     #[test]
     fn pace_counts_what_is_left() {
-        assert_eq!(super::pace(0, 10, 1.0), "starting");
-        assert_eq!(super::pace(2_000_000, 10_000_000, 1.0), "2.00 M voxels/s, 4.0 s left");
-        assert_eq!(super::pace(20, 10, 1.0), "20 voxels/s, 0 ms left");
+        assert_eq!(super::pace(0, 10, 1.0, "compute"), "starting");
+        assert_eq!(super::pace(2_000_000, 10_000_000, 1.0, "compute"), "2.00 M voxels/s, 4.0 s left");
+        assert_eq!(super::pace(20, 10, 1.0, "compute"), "20 voxels/s, 0 ms left");
+        assert_eq!(super::pace(3 << 20, 6 << 20, 1.0, "unpack"), "3.00 MiB/s, 1.0 s left");
     }
 }

@@ -176,6 +176,12 @@ pub fn described(path: &Path, level: usize, raw: &RawArgs, attributes: &Attribut
         // NIfTI keeps the components of an output as times.
         input.time = Select::All;
     }
+    // Formats that cannot say it themselves.
+    if ["raw", "npy"].iter().any(|e| path.extension().is_some_and(|x| x.eq_ignore_ascii_case(e)))
+        && let Some((spacing, unit)) = attributes.spacing()
+    {
+        (input.spacing, input.unit) = (Some(spacing), unit);
+    }
     if let (InputKind::Path { raw: Some(raw), .. }, true) = (&mut input.kind, own) {
         raw.components = attributes.components.unwrap_or(1);
     }

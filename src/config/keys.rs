@@ -215,7 +215,7 @@ pub const KEYS: &[Key] = &[
     key(Pareto, "seed", Kind::Int { min: 0, max: i64::MAX }, Toml("0"), "which bricks the sample holds"),
     key(Pareto, "folder", Kind::Path, Toml("\"pareto\""), "where outputs, pareto.csv, pareto.json and pareto.svg go"),
     key(Pareto, "repeat", Kind::Int { min: 1, max: 100 }, Toml("1"), "runs per combination, whose median counts, after one more to warm up where it is above 1"),
-    key(Pareto, "keep", Kind::Bool, Toml("false"), "whether the volumes of runs and truths are kept"),
+    key(Pareto, "keep", Kind::Bool, Toml("false"), "whether the volumes of runs and truths are kept, in `volumes` in the folder"),
 ];
 
 /// Keys of a section (for stages: of one `op`), in the table's order.

@@ -2,7 +2,7 @@
 //! value given and what would be accepted.
 
 use super::kinds::{MAX_EDGE, MAX_EXTENT, MAX_RADIUS};
-use super::tree::{Node, Table, Value, find};
+use super::tree::{Node, Table, Value};
 use super::{Codec, Length, Select, units};
 use crate::grid::{Border, DType};
 
@@ -359,11 +359,6 @@ fn toml_value(node: &Node) -> toml::Value {
         Value::List(items) => toml::Value::Array(items.iter().map(toml_value).collect()),
         Value::Table(t) => toml::Value::Table(toml_table(t)),
     }
-}
-
-/// Whether a table has a key.
-pub fn has(table: &Table, key: &str) -> bool {
-    find(table, key).is_some()
 }
 
 #[cfg(test)]

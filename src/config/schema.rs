@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value, json};
 
-use super::keys::{self, Default, KEYS, Key, OPS, Section};
+use super::keys::{self, Default, Key, OPS, Section};
 use super::kinds::Kind;
 use super::{read, tree};
 
@@ -42,7 +42,15 @@ fn object(section: Section, op: &str) -> Value {
             required.push(key.name);
         }
     }
-    json!({"type": "object", "properties": properties, "required": required, "additionalProperties": false})
+    let mut schema =
+        json!({"type": "object", "properties": properties, "required": required, "additionalProperties": false});
+    if op == "combine" {
+        // Two names of one key.
+        required.retain(|key| *key != "inputs");
+        schema["required"] = json!(required);
+        schema["oneOf"] = json!([{"required": ["inputs"]}, {"required": ["input"]}]);
+    }
+    schema
 }
 
 fn property(key: &Key, op: &str) -> Value {
@@ -66,24 +74,4 @@ pub(super) fn default_value(text: &str) -> Value {
     let table = tree::parse(&format!("v = {text}")).map(|t| read::toml_table(&t));
     let value = table.ok().and_then(|t| serde_json::to_value(&t["v"]).ok());
     value.unwrap_or_else(|| json!(text))
-}
-
-/// A row per key: dotted name, accepted values, default, meaning. For documents and tests.
-pub fn rows() -> impl Iterator<Item = (String, String, String, &'static str)> {
-    KEYS.iter().map(|key| {
-        let table = match key.section {
-            Section::Run => "run",
-            Section::Input => "input.NAME",
-            Section::Stage => "stage.NAME",
-            Section::Output => "output.NAME",
-            Section::Where => "stage.NAME.where",
-            Section::Pareto => "pareto",
-        };
-        let default = match key.default {
-            Default::Toml(text) => text.to_string(),
-            Default::Required => "must be given".to_string(),
-            Default::Absent(meaning) => meaning.to_string(),
-        };
-        (format!("{table}.{}", key.name), key.kind.accepts(), default, key.doc)
-    })
 }

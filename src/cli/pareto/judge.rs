@@ -81,8 +81,7 @@ fn range(of: &Judges, run: &Volume, components: usize, cancel: &Cancel) -> Resul
     for c in 0..components {
         blocks(&[(of.truth, c)], of.judged, cancel, |values, _| all = all.merge(Moments::of(&values[0])))?;
     }
-    let range = all.max - all.min;
-    Ok(if range > 0.0 && range.is_finite() { range } else { 1.0 })
+    Ok(all.dynamic_range())
 }
 
 /// Errors of a run; of all components together.

@@ -10,6 +10,7 @@ mod settings;
 mod table;
 mod truth;
 mod two_pass;
+mod work;
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -27,6 +28,7 @@ use judge::{Errors, Judges};
 use settings::{combinations, label, variant};
 use table::Row;
 use truth::{Ground, Truth, open};
+use work::Work;
 
 /// The gradients of the judged parts of lattices; `None` where there is none.
 type Gradient = Option<(PathBuf, f64)>;
@@ -34,10 +36,10 @@ type Gradient = Option<(PathBuf, f64)>;
 /// Runs every combination, then prints and writes the table.
 pub fn run(args: &ParetoArgs, quiet: bool) -> Result<()> {
     let base = load(&args.config, &[])?;
-    let job = table_of(&base)?;
+    let results = table_of(&base)?;
     let cancel = messages::interrupts();
-    std::fs::create_dir_all(&job.folder)
-        .map_err(|e| Error::file(&job.folder, format!("cannot make the folder: {e}")))?;
+    let work = Work::make(results, &base)?;
+    let job = &Pareto { folder: work.path.clone(), ..results.clone() };
     let say = |text: &str| {
         if !quiet {
             messages::note(text);
@@ -53,9 +55,9 @@ pub fn run(args: &ParetoArgs, quiet: bool) -> Result<()> {
         "runs": rows.iter().map(Row::json).collect::<Vec<_>>(),
         "cheapest": args.max_error.map(|bound| table::cheapest(&rows, bound).map(Row::json)),
     });
-    write_whole(&job.folder.join("pareto.json"), format!("{json:#}\n").as_bytes())?;
-    write_whole(&job.folder.join("pareto.csv"), table::csv(job, &rows).as_bytes())?;
-    write_whole(&job.folder.join("pareto.svg"), table::picture(job, &rows).as_bytes())?;
+    write_whole(&results.folder.join("pareto.json"), format!("{json:#}\n").as_bytes())?;
+    write_whole(&results.folder.join("pareto.csv"), table::csv(job, &rows).as_bytes())?;
+    write_whole(&results.folder.join("pareto.svg"), table::picture(job, &rows).as_bytes())?;
     if args.json {
         return messages::result_json(&json);
     }
@@ -78,22 +80,28 @@ fn table_of(config: &Config) -> Result<&Pareto> {
 
 /// Combinations with their configs and outputs. What the config refuses is found before hours of runs, and left out.
 fn accepted(args: &ParetoArgs, job: &Pareto, say: &dyn Fn(&str)) -> Result<Vec<(Table, Config, PathBuf)>> {
-    let mut accepted = Vec::new();
+    let (mut accepted, mut refused) = (Vec::new(), Vec::new());
     for (i, settings) in combinations(job).into_iter().enumerate() {
         let path = job.folder.join(format!("run{i}.zarr"));
         match variant(args, job, &settings, &path) {
             Ok(config) => accepted.push((settings, config, path)),
-            Err(e) => say(&format!("left out: {}: {e}", label(&settings))),
+            Err(e) => {
+                say(&format!("left out: {}: {e}", label(&settings)));
+                refused.push(format!("{}: {e}", label(&settings)));
+            }
         }
     }
     match accepted.is_empty() {
-        true => Err(none_left(job, args)),
+        true => Err(none_left(job, args, &refused)),
         false => Ok(accepted),
     }
 }
 
-fn none_left(job: &Pareto, args: &ParetoArgs) -> Error {
-    job.place.error("vary", "no combination is accepted").located(&args.config.config, None)
+/// Says why the first one was refused.
+fn none_left(job: &Pareto, args: &ParetoArgs, refused: &[String]) -> Error {
+    let first = refused.first().map_or("", String::as_str);
+    let message = format!("none of {} combinations is accepted; the first: {first}", refused.len());
+    job.place.error("vary", message).located(&args.config.config, None)
 }
 
 /// Runs and judges all combinations; the truths, whose volumes are gone unless they are kept.
@@ -105,14 +113,15 @@ fn all_rows(
     let (job, cancel) = (ground.job, ground.cancel);
     let mut truths: Vec<Truth> = Vec::new();
     let mut gradient: Option<Gradient> = None;
-    let mut rows = Vec::new();
+    let (mut rows, mut refused) = (Vec::new(), Vec::new());
     let total = accepted.len();
     for (i, (settings, config, path)) in accepted.into_iter().enumerate() {
         let cost = match cost::timed(&config, job.repeat, cancel) {
             Ok(cost) => cost,
             // The planner refuses, or there is no such device.
-            Err(e @ Error::Config { .. }) => {
+            Err(e @ (Error::Config { .. } | Error::NoDevice(_))) => {
                 say(&format!("left out: {}: {e}", label(&settings)));
+                refused.push(format!("{}: {e}", label(&settings)));
                 continue;
             }
             Err(e) => return Err(e),
@@ -152,7 +161,7 @@ fn all_rows(
     }
     table::mark_front(&mut rows);
     match rows.is_empty() {
-        true => Err(none_left(job, ground.args)),
+        true => Err(none_left(job, ground.args, &refused)),
         false => Ok((rows, truths)),
     }
 }
