@@ -246,3 +246,83 @@ fn a_small_region_does_not_make_a_prepass_dear() {
         assert_eq!(*v, all[(z * 96 + y) * 96 + x], "{z} {y} {x}");
     }
 }
+
+/// A mask leaves parts of bricks out: kernels run on boxes around the rest, and nobody sees which.
+#[test]
+fn kernels_run_on_boxes_around_what_is_needed_and_the_result_does_not_show_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [70, 90, 200];
+    // Noise everywhere, and a mask of two far balls, a plane and single voxels.
+    let noise = |z: usize, y: usize, x: usize| (hash(3, ((z * 90 + y) * 200 + x) as u64) % 997) as u16;
+    let near = |a: [i64; 3], z: usize, y: usize, x: usize, r: i64| {
+        [z, y, x].iter().zip(a).map(|(p, c)| (*p as i64 - c).pow(2)).sum::<i64>() <= r * r
+    };
+    let mask = fill(shape, |z, y, x| {
+        let ball = near([12, 20, 30], z, y, x, 9) || near([60, 70, 180], z, y, x, 7);
+        u16::from(ball || (z == 40 && y > 60) || hash(9, ((z * 90 + y) * 200 + x) as u64).is_multiple_of(40_000))
+    });
+    let values = fill(shape, noise);
+    write_npy(&dir.path().join("m.npy"), "<u2", shape, &u16_bytes(&mask));
+    write_npy(&dir.path().join("u2.npy"), "<u2", shape, &u16_bytes(&values));
+    let bytes: Vec<u8> = values.iter().map(|v| (v % 251) as u8).collect();
+    write_npy(&dir.path().join("u1.npy"), "|u1", shape, &bytes);
+    let floats: Vec<f32> = values.iter().map(|&v| if v == 7 { f32::NAN } else { f32::from(v) * 0.37 }).collect();
+    write_npy(&dir.path().join("f4.npy"), "<f4", shape, &f32_bytes(&floats));
+    let wide: Vec<u8> = floats.iter().flat_map(|v| f64::from(*v).to_le_bytes()).collect();
+    write_npy(&dir.path().join("f8.npy"), "<f8", shape, &wide);
+    let stages = [
+        ("op='box'\nradius=[2, 3, 5]", "variance"),
+        ("op='box'\nradius=3\nborder='reflect'", "max"),
+        ("op='ambient_occlusion'\nmethod='cdf_power'\nradius=4", "openness"),
+        ("op='ambient_occlusion'\nmethod='gaussian_cdf'\nradius=3\nborder={ constant = 5.0 }", "openness"),
+        ("op='ambient_occlusion'\nmethod='exact'\nradius=3", "openness"),
+        ("op='ambient_occlusion'\nmethod='exact'\nradius=5\nregion='ball'", "openness"),
+        ("op='ambient_occlusion'\nmethod='exact'\nradius=[2, 12, 12]", "openness"),
+        ("op='ambient_occlusion'\nmethod='levels'\nradius=4", "openness"),
+        ("op='ambient_occlusion'\nmethod='moments4'\nradius=4", "lower"),
+        ("op='gaussian'\nsigma=1.5", "variance"),
+        ("op='gradient'\nsize=5", "vector"),
+    ];
+    let afresh = occlude::run::RunOptions { overwrite: true, ..Default::default() };
+    let plain = occlude::run::RunOptions { no_skip: true, ..afresh.clone() };
+    for input in ["u1", "u2", "f4", "f8"] {
+        for (stage, channel) in stages {
+            let text = format!(
+                "[run]\nthreads = 2\n[input.a]\npath = '{input}.npy'\n[input.m]\npath = 'm.npy'\n[stage.s]\n{stage}\n\
+                 input = 'a'\nwhere = {{ input = 'm', min = 1 }}\n[output.o]\npath = 'o.npy'\nfrom = 's.{channel}'\n"
+            );
+            let config = parse(dir.path(), &text, &[]);
+            run_with(&config, &afresh);
+            let boxes = decode(&dir.path().join("o.npy"));
+            run_with(&config, &plain);
+            assert_same(&format!("{input} {stage}"), &decode(&dir.path().join("o.npy")), &boxes);
+        }
+    }
+}
+
+/// Bricks of one value are one value in every level of an occlusion map; nobody sees that they were not computed.
+#[test]
+fn constant_bricks_of_occlusion_maps_are_not_computed() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [96, 90, 131];
+    let island = |z: usize, y: usize, x: usize| z < 40 && y > 50 && x > 80;
+    for (value, nodata) in [(0u16, None), (77, None), (9, Some(9))] {
+        let voxel = |z, y, x| if island(z, y, x) { 1000 + ((z * 7 + y * 31 + x * 3) % 5000) as u16 } else { value };
+        write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&fill(shape, voxel)));
+        let nodata = nodata.map_or(String::new(), |n: i32| format!("nodata = {n}\n"));
+        for (from, dtype) in [("map.mean", "'u8'\nrange = [0, 6000]"), ("map.variance", "'f32'")] {
+            let text = format!(
+                "[run]\nbrick = 16\n[input.a]\npath = 'vol.npy'\nslope = 0.3\nintercept = 0.1\n{nodata}[stage.map]\n\
+                 op = 'occlusion_map'\ninput = 'a'\nstart_level = 0\n[output.o]\npath = 'o.zarr'\nfrom = '{from}'\n\
+                 dtype = {dtype}\nchunk = 16\nshard = 32\n"
+            );
+            let afresh = occlude::run::RunOptions { overwrite: true, ..Default::default() };
+            let config = parse(dir.path(), &text, &[]);
+            let report = run_with(&config, &afresh);
+            assert!(skipped(&report, "constant") > 100, "{:?}", report.bricks);
+            let skipping = decode(&dir.path().join("o.zarr"));
+            run_with(&config, &occlude::run::RunOptions { no_skip: true, ..afresh });
+            assert_same(&text, &decode(&dir.path().join("o.zarr")), &skipping);
+        }
+    }
+}

@@ -30,12 +30,17 @@ impl<'a> AnyView<'a> {
     }
 }
 
-impl AnyViewMut<'_> {
+impl<'a> AnyViewMut<'a> {
     pub fn as_view(&self) -> AnyView<'_> {
         macro_rules! arms {
             ($($t:ident),*) => { match self { $(AnyViewMut::$t(v) => AnyView::$t(v.as_view()),)* } };
         }
         arms!(U8, I8, U16, I16, U32, I32, F32, F64)
+    }
+
+    /// The part of `shape` voxels that starts at `lo`. Panics if it sticks out.
+    pub fn part(self, lo: [usize; 3], shape: Shape) -> AnyViewMut<'a> {
+        map_any!(AnyViewMut, self, v => v.part(lo, shape))
     }
 
     /// A shorter borrow of the same voxels.

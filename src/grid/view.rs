@@ -89,6 +89,13 @@ impl<'a, T> ViewMut<'a, T> {
         self.data[z * self.plane + y * self.row + x] = value;
     }
 
+    /// The part of `shape` voxels that starts at `lo`. Panics if it sticks out.
+    pub fn part(self, lo: [usize; 3], shape: Shape) -> ViewMut<'a, T> {
+        assert!((0..3).all(|a| lo[a] + shape[a] <= self.shape[a]), "{lo:?} + {shape:?} sticks out of {:?}", self.shape);
+        let start = (lo[0] * self.plane + lo[1] * self.row + lo[2]).min(self.data.len());
+        ViewMut { data: &mut self.data[start..], shape, plane: self.plane, row: self.row }
+    }
+
     pub fn as_view(&self) -> View<'_, T> {
         View { data: self.data, shape: self.shape, plane: self.plane, row: self.row }
     }

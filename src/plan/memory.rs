@@ -1,12 +1,13 @@
 //! Bytes by formula: what one brick of a given shape keeps alive at its worst moment, and what the run keeps besides.
 
-use super::graph::{GradientChannel, Moment, Producer, Step, StepId, StepKind, WireId};
+use super::graph::{GradientChannel, Mask, Moment, Producer, Step, StepId, StepKind, WireId};
 use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan, flows};
+use crate::config::WhereRule;
 use crate::gpu::flow::Flow;
 use crate::gpu::{facts, passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
-use crate::kernel::{gaussian, gradient, levels, moments4, rank, reduce, window};
+use crate::kernel::{gaussian, gradient, levels, mask, moments4, rank, reduce, window};
 
 /// What the program itself, thread stacks and the allocator's slack take of the ceiling.
 pub const FIXED: u64 = 16 << 20;
@@ -62,7 +63,17 @@ pub fn scratch_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
         step_scratch(plan, step, shape, group.shape)
             + if plan.on_gpu(s) { redone(plan, step, shape, group.shape) } else { 0 }
     });
-    steps.max().unwrap_or(0)
+    // Readers look at masks of inputs while workers compute.
+    let looks = group.steps.iter().map(|&s| mask_scratch(plan, &plan.graph.steps[s], shape, group.shape));
+    steps.max().unwrap_or(0) + looks.max().unwrap_or(0)
+}
+
+/// Scratch of the mask of a step.
+fn mask_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
+    let Some(Mask { wire, rule: WhereRule::Iso { iso, band }, reach }) = &step.mask else { return 0 };
+    let spacing = plan.graph.lattices[plan.graph.wires[*wire].lattice].spacing;
+    let dst = grown(brick, step.halo, volume);
+    mask::scratch_bytes(grown(dst, *reach, volume), dst, &mask::Band { iso, width: *band, spacing }) as u64
 }
 
 fn sum(list: &[(WireId, u64)]) -> u64 {
@@ -78,6 +89,9 @@ fn grown(shape: Shape, halo: [usize; 3], volume: Shape) -> Shape {
     std::array::from_fn(|a| (shape[a] + 2 * halo[a]).min(volume[a]))
 }
 
+/// Voxels of a brick with its border copy at most, or so: a million million.
+const MOST_PADDED: f64 = 1e12;
+
 /// Kernel scratch, border copies and masks of one step.
 fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     let dst = grown(brick, step.halo, volume);
@@ -85,8 +99,15 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     let padded: Shape = std::array::from_fn(|a| dst[a] + 2 * step.reach[a]);
     let (src, copy) = match step.border {
         Border::Clip => (std::array::from_fn(|a| padded[a].min(volume[a])), 0),
-        _ => (padded, padded.iter().product::<usize>() * window_dtype(wire.dtype, step.border).size()),
+        _ => {
+            let copy = padded.iter().fold(window_dtype(wire.dtype, step.border).size(), |n, &p| n.saturating_mul(p));
+            (padded, copy)
+        }
     };
+    // Beyond any memory, and too much for the products below.
+    if padded.iter().map(|&n| n as f64).product::<f64>() > MOST_PADDED && step.border != Border::Clip {
+        return 1 << 52;
+    }
     let dtype = window_dtype(wire.dtype, step.border);
     let kernel = match &step.kind {
         StepKind::Window { params, channels } => window::scratch_bytes(dtype, src, dst, params, channels),

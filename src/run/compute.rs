@@ -93,7 +93,7 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
             && !masks.iter().any(|(m, _)| *m == s)
         {
             let value = values[mask.wire].as_mut().expect("a mask's wire is made before its reader");
-            masks.push((s, engine.mask(mask, value, region, volume)));
+            masks.push((s, engine.mask(mask, value, region, volume, scratch)));
         }
         let known = masks.iter().find(|(m, _)| *m == s).map_or(&MaskValue::All, |(_, m)| m);
         let since = Since::now();

@@ -6,6 +6,7 @@ use crate::brick::Scratch;
 use crate::gpu::{Gpu, GpuError};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
 use crate::kernel::gradient::GradientOut;
+use crate::kernel::mask::Part;
 use crate::kernel::obscurance::{ObscuranceIo, Prepared};
 use crate::kernel::{Context, pointwise};
 use crate::plan::graph::{GradientChannel, ObscuranceChannel, Producer, Step, StepId, StepKind};
@@ -153,11 +154,11 @@ impl<'a> Engine<'a> {
     }
 }
 
-/// Where the channels of a gradient go.
-pub(super) fn gradient_out<'v>(channels: &[GradientChannel], outputs: &'v mut [Value]) -> GradientOut<'v> {
+/// Where the channels of a gradient of a part go.
+pub(super) fn gradient_out<'v>(channels: &[GradientChannel], outputs: &'v mut [Value], part: &Part) -> GradientOut<'v> {
     let mut out = GradientOut::default();
     for (channel, value) in channels.iter().zip(outputs) {
-        let mut views = views_mut(value);
+        let mut views: Vec<AnyViewMut> = views_mut(value).into_iter().map(|v| v.part(part.lo, part.shape)).collect();
         match channel {
             GradientChannel::Magnitude => out.magnitude = views.pop(),
             GradientChannel::Vector => out.vector = Some(three(views)),

@@ -11,6 +11,7 @@ mod flows;
 pub mod journal;
 mod lanes;
 pub mod maps;
+mod masked;
 pub mod metrics;
 pub mod options;
 pub mod outputs;

@@ -11,7 +11,7 @@ use super::program::Program;
 use super::steps::{Engine, MaskValue};
 use super::value::{Comp, Value, common_value, copy_into};
 use crate::Result;
-use crate::brick::gather;
+use crate::brick::{Scratch, gather};
 use crate::grid::{AnyViewMut, Region, Voxel};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
@@ -53,8 +53,8 @@ pub struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    /// Reads the brick at `place` in the stream's order.
-    pub fn read(&self, brick: Region, place: u32) -> Result<Loaded> {
+    /// Reads the brick at `place` in the stream's order. `scratch` is for masks.
+    pub fn read(&self, brick: Region, place: u32, scratch: &mut Scratch) -> Result<Loaded> {
         let start = Instant::now();
         let plan = self.engine.plan;
         let volume = Region::whole(self.program.volume);
@@ -71,7 +71,7 @@ impl Reader<'_> {
             let region = self.program.step_box(plan, s, brick);
             let wanted = region.grow(mask.reach).clip(&volume);
             let (mut value, _) = self.input(input, mask.wire, wanted, place, Why::Mask)?;
-            let known = self.engine.mask(mask, &mut value, region, volume);
+            let known = self.engine.mask(mask, &mut value, region, volume, scratch);
             value.recycle(self.engine.pool);
             if matches!(known, MaskValue::None) && self.engine.skip {
                 off.push(s);

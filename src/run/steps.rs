@@ -1,6 +1,7 @@
 //! Runs one step of the graph on one brick: cuts what the kernel may see, applies the border rule and the mask.
 
 use super::lanes::gradient_out;
+use super::masked::views_of;
 use super::metrics::Metrics;
 use super::repair;
 use super::value::{Comp, Value};
@@ -50,7 +51,19 @@ impl<'a> Engine<'a> {
     }
 
     /// The mask of a step over `region`, from its wire's value.
-    pub fn mask(&self, mask: &Mask, value: &mut Value, region: Region, volume: Region) -> MaskValue {
+    pub fn mask(
+        &self,
+        mask: &Mask,
+        value: &mut Value,
+        region: Region,
+        volume: Region,
+        scratch: &mut Scratch,
+    ) -> MaskValue {
+        if self.skip
+            && let Some(&[constant]) = value.constants().as_deref()
+        {
+            return self.mask_of_constant(mask, constant);
+        }
         value.materialize(self.pool);
         let wire = &self.plan.graph.wires[mask.wire];
         let mut needed = vec![0u8; region.voxels()];
@@ -62,17 +75,9 @@ impl<'a> Engine<'a> {
             WhereRule::Iso { iso, band } => {
                 let src_box = region.grow(mask.reach).clip(&volume);
                 let spacing = self.plan.graph.lattices[wire.lattice].spacing;
-                mask::iso_band(
-                    value.view(0, src_box),
-                    src_box,
-                    wire.affine,
-                    wire.missing,
-                    iso,
-                    *band,
-                    spacing,
-                    dst,
-                    region,
-                );
+                let band = mask::Band { iso, width: *band, spacing };
+                let cx = &mut Context { level: self.level, scratch };
+                mask::iso_band(value.view(0, src_box), src_box, wire.affine, wire.missing, &band, dst, region, cx);
             }
         }
         let count = needed.iter().map(|&n| n as usize).sum::<usize>();
@@ -81,6 +86,16 @@ impl<'a> Engine<'a> {
             n if n == needed.len() => MaskValue::All,
             _ => MaskValue::Some(needed),
         }
+    }
+
+    /// The mask over a box of one value: all of it or nothing, and no surface.
+    fn mask_of_constant(&self, mask: &Mask, value: f64) -> MaskValue {
+        let WhereRule::Range { min, max } = mask.rule else { return MaskValue::None };
+        let wire = &self.plan.graph.wires[mask.wire];
+        let (mut voxel, mut needed) = (Voxels::zeroed(wire.dtype, 1), [0]);
+        voxel.fill(value);
+        mask::range(voxel.view([1; 3]), wire.affine, wire.missing, min, max, ViewMut::dense(&mut needed, [1; 3]));
+        if needed == [1] { MaskValue::All } else { MaskValue::None }
     }
 
     /// Outputs of a step that no voxel needs.
@@ -208,21 +223,34 @@ impl<'a> Engine<'a> {
                 )?;
             }
             StepKind::Gradient { size, weight, spacing, channels, stored } => {
-                let src = self.windowed(step, border, inputs[0], 0, input_wire, region, volume);
-                let out = gradient_out(channels, &mut outputs);
-                let affine = if *stored { Affine::IDENTITY } else { src.affine };
-                let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: src.missing };
-                match self.lane(id, region) {
-                    Some(gpu) => {
-                        let done = gpu.gradient(src.view(), &fit, affine, src.at, out, &mut cx);
-                        done.map_err(|e| self.gpu_failed(id, &e))?;
-                    }
-                    None => {
-                        let Fit { missing, .. } = fit;
-                        gradient::gradient(src.view(), *size, *weight, *spacing, affine, missing, src.at, out, &mut cx);
+                let whole = self.windowed(step, border, inputs[0], 0, input_wire, region, volume);
+                let affine = if *stored { Affine::IDENTITY } else { whole.affine };
+                let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: whole.missing };
+                for part in self.parts(id, mask, &whole, region) {
+                    let src = whole.part(&part, step.reach);
+                    let out = gradient_out(channels, &mut outputs, &part);
+                    match self.lane(id, region) {
+                        Some(gpu) => {
+                            let done = gpu.gradient(src.view(), &fit, affine, src.at, out, &mut cx);
+                            done.map_err(|e| self.gpu_failed(id, &e))?;
+                        }
+                        None => {
+                            let Fit { missing, .. } = fit;
+                            gradient::gradient(
+                                src.view(),
+                                *size,
+                                *weight,
+                                *spacing,
+                                affine,
+                                missing,
+                                src.at,
+                                out,
+                                &mut cx,
+                            );
+                        }
                     }
                 }
-                src.recycle(self.pool);
+                whole.recycle(self.pool);
             }
             StepKind::Window { .. }
             | StepKind::Rank { .. }
@@ -231,7 +259,10 @@ impl<'a> Engine<'a> {
             | StepKind::Gaussian { .. } => {
                 for c in 0..input_wire.components {
                     let src = self.windowed(step, border, inputs[0], c, input_wire, region, volume);
-                    self.windows(id, &src, &mut outputs, c, &mut cx)?;
+                    for part in self.parts(id, mask, &src, region) {
+                        let outs = views_of(&mut outputs, c, &part);
+                        self.windows(id, &src.part(&part, step.reach), outs, region, &mut cx)?;
+                    }
                     repair::missing(&wires, inputs[0], c, input_wire, &mut outputs, region);
                     repair::undefined(&wires, inputs[0], c, input_wire, &mut outputs, region);
                     src.recycle(self.pool);
@@ -242,18 +273,21 @@ impl<'a> Engine<'a> {
         Ok(outputs)
     }
 
-    /// A kernel of windows on one component.
-    fn windows(&self, id: StepId, src: &Windowed, outputs: &mut [Value], c: usize, cx: &mut Context) -> Result<()> {
+    /// A kernel of windows on one component of a part of `region`; `outs` go with the step's outputs.
+    fn windows(
+        &self,
+        id: StepId,
+        src: &Windowed,
+        mut outs: Vec<AnyViewMut>,
+        region: Region,
+        cx: &mut Context,
+    ) -> Result<()> {
         let step = &self.plan.graph.steps[id];
-        let region = outputs[0].region;
         match &step.kind {
             StepKind::Window { params, channels } => {
                 let params = WindowParams { missing: src.missing, ..*params };
-                let mut outs: Vec<WindowOut> = channels
-                    .iter()
-                    .zip(outputs)
-                    .map(|(&channel, value)| WindowOut { channel, dst: view_mut(value, c) })
-                    .collect();
+                let mut outs: Vec<WindowOut> =
+                    channels.iter().zip(outs).map(|(&channel, dst)| WindowOut { channel, dst }).collect();
                 match self.lane(id, region) {
                     Some(gpu) => {
                         let done = gpu.window(src.view(), &params, src.at, src.voxel, &mut outs, cx);
@@ -264,32 +298,29 @@ impl<'a> Engine<'a> {
             }
             StepKind::Rank { params, shape, ties } => {
                 let params = WindowParams { missing: src.missing, ..*params };
-                rank::rank(src.view(), &params, *shape, *ties, src.at, view_mut(&mut outputs[0], c), cx);
+                rank::rank(src.view(), &params, *shape, *ties, src.at, outs.swap_remove(0), cx);
             }
             StepKind::Levels { params, levels, ties } => {
                 let params = WindowParams { missing: src.missing, ..*params };
                 let found = levels::Levels::from_numbers(&self.globals[*levels]);
-                levels::levels(src.view(), &found, &params, *ties, src.at, view_mut(&mut outputs[0], c), cx);
+                levels::levels(src.view(), &found, &params, *ties, src.at, outs.swap_remove(0), cx);
             }
             StepKind::Moments4 { params, codes, ties, channels } => {
                 let params = WindowParams { missing: src.missing, ..*params };
                 let codes = codes.map(|g| Codes::new(&levels::Levels::from_numbers(&self.globals[g])));
-                let mut outs: Vec<BoundOut> = channels
-                    .iter()
-                    .zip(outputs)
-                    .map(|(&channel, value)| BoundOut { channel, dst: view_mut(value, c) })
-                    .collect();
+                let mut outs: Vec<BoundOut> =
+                    channels.iter().zip(outs).map(|(&channel, dst)| BoundOut { channel, dst }).collect();
                 moments4::moments4(src.view(), codes.as_ref(), &params, *ties, src.at, &mut outs, cx);
             }
             StepKind::Gaussian { sigma, channels } => {
                 let (mut mean, mut unrounded, mut variance) = (None, None, None);
-                for (channel, value) in channels.iter().zip(outputs) {
-                    match (channel, value.dtype) {
+                for (channel, out) in channels.iter().zip(outs) {
+                    match (channel, out.dtype()) {
                         (Moment::Mean, dtype) if dtype != src.view().dtype().result() || mean.is_some() => {
-                            unrounded = Some(view_mut(value, c))
+                            unrounded = Some(out)
                         }
-                        (Moment::Mean, _) => mean = Some(view_mut(value, c)),
-                        (Moment::Variance, _) => variance = Some(view_mut(value, c)),
+                        (Moment::Mean, _) => mean = Some(out),
+                        (Moment::Variance, _) => variance = Some(out),
                     }
                 }
                 let Windowed { affine, missing, at, .. } = *src;

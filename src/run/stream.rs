@@ -2,7 +2,7 @@
 //! comes out; bounded channels between, one gate for bytes, the first error stops the rest.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
 
 use super::budget::{Budget, Permit};
@@ -76,20 +76,22 @@ impl<W: Send> Stream<'_, W> {
         let queue = Queue { next: Mutex::new(0), work: self.work };
         // As many as the plan counts: scratch stays allocated between bricks.
         let at_once = (self.budget / self.brick_bytes.max(1)).clamp(1, self.threads as u64);
-        let scratches: Vec<Mutex<Scratch>> = (0..at_once).map(|_| Mutex::new(Scratch::new())).collect();
+        let scratches = || (0..at_once).map(|_| Mutex::new(Scratch::new())).collect::<Vec<_>>();
+        let (of_readers, of_workers) = (scratches(), scratches());
         let (to_compute, ready) = crossbeam_channel::bounded::<(Work, Loaded, Permit)>(self.threads);
         let (to_write, finished) = crossbeam_channel::bounded::<(Work, W, Permit)>(self.threads + 1);
         std::thread::scope(|scope| {
-            for _ in 0..readers {
+            for reader in 0..readers {
                 let to_compute = to_compute.clone();
-                scope.spawn(|| self.read_loop(&queue, &budget, &first, to_compute));
+                let (queue, budget, first, scratches) = (&queue, &budget, &first, &of_readers);
+                scope.spawn(move || self.read_loop(queue, budget, first, scratches, reader, to_compute));
             }
             for _ in 0..2 {
                 let finished = finished.clone();
                 scope.spawn(|| self.write_loop(&first, finished));
             }
             drop((to_compute, finished));
-            let (first, scratches, to_write) = (&first, &scratches, to_write);
+            let (first, scratches, to_write) = (&first, &of_workers, to_write);
             self.pool.in_place_scope(|workers| {
                 for (work, loaded, permit) in ready {
                     let to_write = to_write.clone();
@@ -108,6 +110,8 @@ impl<W: Send> Stream<'_, W> {
         queue: &Queue,
         budget: &Arc<Budget>,
         first: &FirstError,
+        scratches: &[Mutex<Scratch>],
+        reader: usize,
         out: crossbeam_channel::Sender<(Work, Loaded, Permit)>,
     ) {
         loop {
@@ -125,7 +129,7 @@ impl<W: Send> Stream<'_, W> {
             drop(next);
             self.metrics.waited("budget", waited);
             let start = Instant::now();
-            let read = guarded(|| self.reader.read(work.brick, place));
+            let read = guarded(|| self.reader.read(work.brick, place, &mut free(scratches, reader)));
             self.trace.span("read", start, &[("brick", format!("{:?}", work.brick))]);
             match read {
                 Ok(loaded) => {
@@ -157,9 +161,7 @@ impl<W: Send> Stream<'_, W> {
         }
         let worker = rayon::current_thread_index().unwrap_or(0);
         let _span = tracing::debug_span!("brick", region = ?work.brick, worker).entered();
-        let free = scratches.iter().find_map(|s| s.try_lock().ok());
-        let mine = || scratches[worker % scratches.len()].lock().unwrap_or_else(|e| e.into_inner());
-        let mut scratch = free.unwrap_or_else(mine);
+        let mut scratch = free(scratches, worker);
         let result = guarded(|| {
             let engine = self.reader.engine;
             let done = evaluate(self.reader, loaded, &mut scratch, self.trace)?;
@@ -201,6 +203,12 @@ impl<W: Send> Stream<'_, W> {
             (self.tick)();
         }
     }
+}
+
+/// A scratch that nobody uses, or a thread's own once it is free: of more threads than bricks may be alive some wait.
+fn free(scratches: &[Mutex<Scratch>], thread: usize) -> MutexGuard<'_, Scratch> {
+    let mine = || scratches[thread % scratches.len()].lock().unwrap_or_else(|e| e.into_inner());
+    scratches.iter().find_map(|s| s.try_lock().ok()).unwrap_or_else(mine)
 }
 
 /// A bug in a kernel must end the run with an error, not take the process and its journal down.

@@ -4,6 +4,7 @@ use super::steps::Engine;
 use super::value::Value;
 use crate::brick::{Pool, Voxels, gather};
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, Region, Shape, Voxel};
+use crate::kernel::mask::{Part, Sight};
 use crate::kernel::pointwise;
 use crate::plan::graph::{Step, Wire};
 
@@ -27,6 +28,17 @@ impl Windowed<'_> {
         match &self.src {
             Src::Borrowed(v) => *v,
             Src::Owned(v, shape) => v.view(*shape),
+        }
+    }
+
+    /// What the windows of a part of the output box see.
+    pub fn part(&self, part: &Part, reach: [usize; 3]) -> Windowed<'_> {
+        let seen = Sight { src: self.view().shape(), at: self.at, reach }.of(part);
+        Windowed {
+            src: Src::Borrowed(self.view().part(seen.lo, seen.shape)),
+            at: std::array::from_fn(|a| self.at[a] + part.lo[a] - seen.lo[a]),
+            voxel: std::array::from_fn(|a| self.voxel[a] + part.lo[a] as i64),
+            ..*self
         }
     }
 

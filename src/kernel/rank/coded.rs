@@ -88,11 +88,15 @@ const FROM: [usize; 2] = [900, 15_000];
 
 /// Whether windows are counted this way: their planes fit in a byte, and there are enough voxels.
 pub(super) fn serves(plan: &Plan, dtype: DType) -> bool {
-    let window = plan.radius.map(|r| 2 * r + 1);
-    let from = FROM[usize::from(dtype.size() > 1)];
     plan.reach.is_empty()
-        && window[0].min(plan.src[0]) <= usize::from(u8::MAX)
-        && window.iter().product::<usize>() > from
+        && (2 * plan.radius[0] + 1).min(plan.src[0]) <= usize::from(u8::MAX)
+        && pays(plan.radius, dtype)
+}
+
+/// Whether windows have enough voxels for this way.
+pub(super) fn pays(radius: [usize; 3], dtype: DType) -> bool {
+    let window = radius.map(|r| 2 * r.min(1 << 20) + 1);
+    window.iter().product::<usize>() > FROM[usize::from(dtype.size() > 1)]
 }
 
 /// Writes the openness of every voxel.

@@ -5,7 +5,7 @@ use super::super::{Prepass, PrepassKind};
 use super::{Lowering, UNROUNDED_MEAN};
 use crate::config::{Op, StageNode, Where, WhereRule};
 use crate::grid::{Affine, Border, DType};
-use crate::kernel::mask;
+use crate::kernel::mask::Band;
 use crate::{Error, Result};
 
 impl Lowering<'_> {
@@ -26,7 +26,7 @@ impl Lowering<'_> {
         }
         let reach = match rule {
             WhereRule::Range { .. } => [0; 3],
-            WhereRule::Iso { band, .. } => mask::iso_reach(*band, self.lattice(wire).spacing),
+            WhereRule::Iso { iso, band } => Band { iso, width: *band, spacing: self.lattice(wire).spacing }.reach(),
         };
         Ok(Some(Mask { wire, rule: rule.clone(), reach }))
     }
