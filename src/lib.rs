@@ -1,7 +1,7 @@
 //! `occlude` streams volumes larger than memory through a graph of local filters and writes mip-mapped pyramids of
 //! ambient occlusion, obscurance, variance and moments.
 //!
-//! The folders, from the bottom up (each uses only those before it):
+//! The folders, from the bottom up (each uses only those before it, and all may ask [`kernel::simd`] for the instruction set):
 //!
 //! | folder | what it holds |
 //! |---|---|
@@ -9,8 +9,8 @@
 //! | [`brick`] | voxels in memory: buffers, pool, scratch, halo assembly |
 //! | [`stage`] | what each stage is: prepared parameters; touches no voxel |
 //! | [`kernel`] | voxels to voxels on the CPU; each fast kernel beside its reference |
-//! | [`store`] | boxes of voxels from and to files |
 //! | [`config`] | TOML text to typed configuration |
+//! | [`store`] | boxes of voxels from and to files |
 //! | [`gpu`] | windows, obscurance and Gaussians on a GPU, their facts for the planner |
 //! | [`plan`] | graph to plan: lattices, halos, fusing, bricks, tasks, peak bytes |
 //! | [`run`] | executes a plan: readers, workers, writers, byte budget, journal |

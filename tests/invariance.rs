@@ -341,3 +341,59 @@ fn the_comparison_names_a_changed_voxel() {
     b.get_mut("level 0").unwrap().1[17] = 1;
     assert!(difference(&a, &b).unwrap().contains("[1, 1, 1]"), "{:?}", difference(&a, &b));
 }
+
+/// The sign and the payload of a NaN hang on the instructions that made it; what is stored is one NaN, in flat files, too.
+#[test]
+fn missing_voxels_and_infinities_have_the_same_bytes_in_every_brick() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [3, 20, 64];
+    let mut values: Vec<f32> = (0..shape.iter().product::<usize>()).map(|i| (i % 37) as f32).collect();
+    values[100..160].fill(f32::from_bits(0xffc0_0000));
+    values[161] = f32::from_bits(0x7fc0_0123);
+    (values[700], values[702]) = (f32::INFINITY, f32::NEG_INFINITY);
+    write_npy(&dir.path().join("v.npy"), "<f4", shape, &f32_bytes(&values));
+    let stages = [
+        ("", "a"),
+        ("[stage.s]\nop = 'box'\ninput = 'a'\nradius = [1, 1, 8]\n", "s.mean"),
+        ("[stage.s]\nop = 'gaussian'\ninput = 'a'\nsigma = 1\n", "s.variance"),
+        ("[stage.s]\nop = 'gradient'\ninput = 'a'\n", "s.magnitude"),
+        ("[stage.s]\nop = 'combine'\ninputs = ['a', 'a']\nop_kind = 'add'\n", "s"),
+    ];
+    for (stage, from) in stages {
+        let bytes = |brick: &str| {
+            let text = format!(
+                "[run]\nbrick = {brick}\n[input.a]\npath = 'v.npy'\n{stage}[output.o]\npath = 'o.npy'\nfrom = '{from}'\n"
+            );
+            run_with(
+                &parse(dir.path(), &text, &[]),
+                &occlude::run::RunOptions { overwrite: true, ..Default::default() },
+            );
+            std::fs::read(dir.path().join("o.npy")).unwrap()
+        };
+        let whole = bytes("64");
+        for brick in ["[1, 1, 4]", "[3, 4, 16]"] {
+            assert!(bytes(brick) == whole, "{from} in bricks of {brick}");
+        }
+    }
+}
+
+/// A `nodata` that the type cannot hold is nobody's value.
+#[test]
+fn a_nodata_beyond_the_type_leaves_the_value_range_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [32, 64, 64];
+    let values = fill(shape, |z, y, x| if y < 32 && x < 32 { 0 } else { 50 + ((z + y * 3 + x * 7) % 50) as u8 });
+    write_npy(&dir.path().join("v.npy"), "|u1", shape, &values);
+    let codes = |brick: &str, no_skip: bool| {
+        let text = format!(
+            "[run]\nbrick = {brick}\n[input.a]\npath = 'v.npy'\nnodata = -1024\n[output.o]\npath = 'o.npy'\nfrom = 'a'\n\
+             dtype = 'u8'\nrange = 'auto'\n"
+        );
+        let options = occlude::run::RunOptions { overwrite: true, no_skip, ..Default::default() };
+        run_with(&parse(dir.path(), &text, &[]), &options);
+        std::fs::read(dir.path().join("o.npy")).unwrap()
+    };
+    let whole = codes("32", false);
+    assert_eq!(whole[whole.len() - 32 * 64 * 64], 0, "0 is a value like others");
+    assert!(codes("32", true) == whole && codes("[32, 32, 64]", false) == whole);
+}

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Folder and the folders of this crate that it must never name.
-const NEVER: [(&str, &[&str]); 7] = [
+const NEVER: [(&str, &[&str]); 9] = [
     ("grid", &["brick", "stage", "kernel", "store", "config", "plan", "run", "cli", "gpu"]),
     ("brick", &["stage", "kernel", "store", "config", "plan", "run", "cli", "gpu"]),
     ("stage", &["brick", "kernel", "store", "config", "plan", "run", "cli", "gpu"]),
@@ -13,6 +13,8 @@ const NEVER: [(&str, &[&str]); 7] = [
     ("config", &["brick", "kernel", "store", "plan", "run", "cli", "gpu"]),
     // The plan reads the GPU lane's facts and its arithmetic of bytes; wgpu itself stays in `gpu` (below).
     ("plan", &["run", "cli"]),
+    ("gpu", &["store", "plan", "run", "cli"]),
+    ("run", &["cli"]),
 ];
 
 /// External crate and the folders that may name it.

@@ -431,3 +431,107 @@ fn deleted_outputs_are_made_again_beside_the_others() {
     let error = occlude::run::run(&config, &resume, &Silent).unwrap_err().to_string();
     assert!(error.contains(OUTPUTS[0]) && error.contains("level 0, which is gone"), "{error}");
 }
+
+/// Killed while `--overwrite` deletes: some chunks are gone, the rest of an interrupted run stands.
+#[test]
+fn an_overwrite_that_was_killed_leaves_no_task_done() {
+    let text = "[run]\nthreads = 1\n[input.a]\npath = 'vol.npy'\n[stage.s]\nop = 'box'\ninput = 'a'\nradius = 1\n\
+                [output.o]\npath = 'o.zarr'\nfrom = 's.mean'\nchunk = 8\nshard = 'none'\n";
+    let dir = folder();
+    let config = parse(dir.path(), text, &[]);
+    let options = RunOptions::default();
+    let session = occlude::run::Session::open(&config, &options, &occlude::run::Silent).unwrap();
+    let open = session.open_tasks();
+    session.run_tasks(&open[..open.len() / 2]).unwrap();
+    let error = session.finish().unwrap_err().to_string();
+    assert!(error.contains("tasks are not done"), "{error}");
+    let work = dir.path().join("o.zarr.occlude");
+    assert!(work.join("tasks.log").exists());
+    let overwrite = RunOptions { overwrite: true, ..Default::default() };
+    // Killed before its first task: of the first run nothing is left, neither chunks nor marks.
+    drop(occlude::run::Session::open(&config, &overwrite, &occlude::run::Silent).unwrap());
+    let resume = RunOptions { resume: true, ..Default::default() };
+    let session = occlude::run::Session::open(&config, &resume, &occlude::run::Silent).unwrap();
+    assert_eq!(session.open_tasks().len(), open.len(), "no task of the first run counts");
+    session.run_tasks(&session.open_tasks()).unwrap();
+    assert!(session.run_task(open.len()).is_err(), "there is no such task");
+    session.finish().unwrap();
+    let other = folder();
+    run(other.path(), text, &[]);
+    assert_same("after all", &decode(&other.path().join("o.zarr")), &decode(&dir.path().join("o.zarr")));
+}
+
+#[test]
+fn scratch_that_vanished_is_an_error_and_not_zeros() {
+    let dir = folder();
+    let text = format!("{}\n", CONFIG.replace("chunk = 16", "chunk = 16\nlevels = 5"));
+    let config = parse(dir.path(), &text, &[]);
+    let options = RunOptions::default();
+    let session = occlude::run::Session::open(&config, &options, &occlude::run::Silent).unwrap();
+    let open = session.open_tasks();
+    assert!(open.len() > 1, "one task leaves nothing to resume");
+    session.run_tasks(&open[..1]).unwrap();
+    drop(session);
+    let work = dir.path().join("out/ao.zarr.occlude");
+    let spills: Vec<_> = fs::read_dir(&work).unwrap().map(|e| e.unwrap().path()).collect();
+    let name = |p: &Path| p.file_name().unwrap().to_string_lossy().into_owned();
+    let spill = spills.iter().find(|p| name(p).starts_with("cells.") || name(p).starts_with("level."));
+    fs::remove_file(spill.expect("levels beyond bricks leave scratch")).unwrap();
+    let resume = RunOptions { resume: true, ..Default::default() };
+    let error = occlude::run::Session::open(&config, &resume, &occlude::run::Silent).err().unwrap().to_string();
+    assert!(error.contains("gone or was changed") && error.contains("--overwrite"), "{error}");
+}
+
+/// Every state between the first and the last deletion of an output is still known as this program's.
+#[test]
+fn half_made_and_half_removed_groups_are_ours() {
+    use occlude::store::sink::{Existing, existing};
+    let dir = tempfile::tempdir().unwrap();
+    let group = dir.path().join("o.zarr");
+    let work = dir.path().join("o.zarr.occlude");
+    fs::create_dir_all(&group).unwrap();
+    assert_eq!(existing(&group), Existing::Foreign, "an empty folder is anybody's");
+    fs::create_dir_all(&work).unwrap();
+    fs::write(work.join("meta.json"), "{\"complete\":false}").unwrap();
+    let ours = Existing::Ours { complete: false, occlude: None };
+    assert_eq!(existing(&group), ours);
+    fs::write(group.join(".zgroup"), "{\"zarr_format\":2}").unwrap();
+    assert_eq!(existing(&group), ours, "killed before the attributes");
+    fs::write(group.join("notes.txt"), "mine").unwrap();
+    assert_eq!(existing(&group), Existing::Foreign);
+}
+
+/// `nohup` and jobs in the background of a script ignore signals: a run that they start goes on; others drain.
+#[cfg(unix)]
+#[test]
+fn signals_that_were_ignored_at_the_start_stay_so() {
+    let text = "[run]\nthreads = 1\nbrick = 32\n[input.a]\nsynthetic = 'noise'\nshape = [160, 160, 160]\ndtype = 'u16'\n\
+                [stage.s]\nop = 'ambient_occlusion'\nmethod = 'exact'\ninput = 'a'\nradius = 9\n[output.o]\npath = 'o.zarr'\nfrom = 's'\n";
+    for (trap, signal, code) in
+        [("trap '' HUP", libc::SIGHUP, 0), ("trap '' INT", libc::SIGINT, 0), ("trap - HUP", libc::SIGHUP, 130)]
+    {
+        let dir = tempfile::tempdir().unwrap();
+        fs::write(dir.path().join("c.toml"), text).unwrap();
+        let mut command = Command::new("sh");
+        command.args(["-c", &format!("{trap}; exec \"$0\" run c.toml -q")]).arg(program());
+        let as_usual = || {
+            // SAFETY: valid dispositions of signals that exist; whoever runs the tests may ignore them.
+            unsafe {
+                libc::signal(libc::SIGHUP, libc::SIG_DFL);
+                libc::signal(libc::SIGINT, libc::SIG_DFL);
+            }
+            Ok(())
+        };
+        // SAFETY: `signal` may be called between fork and exec.
+        unsafe { std::os::unix::process::CommandExt::pre_exec(&mut command, as_usual) };
+        let mut child = command.current_dir(dir.path()).stderr(Stdio::null()).spawn().unwrap();
+        // Until the run has begun, and with it the handler stands.
+        while !dir.path().join("o.zarr.occlude").exists() {
+            std::thread::sleep(Duration::from_millis(5));
+            assert!(child.try_wait().unwrap().is_none(), "it ended before it began");
+        }
+        // SAFETY: a signal to a child of ours that was not waited for.
+        assert_eq!(unsafe { libc::kill(child.id() as i32, signal) }, 0);
+        assert_eq!(child.wait().unwrap().code(), Some(code), "{trap}");
+    }
+}

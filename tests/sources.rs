@@ -423,6 +423,57 @@ fn nrrd_lists_patterns_and_skips() {
     check(&file_input(&at("v.mhd")), 0, 0);
     fs::write(at("v.mhd"), format!("{mha}HeaderSize = -1\nElementDataFile = all.bin\n")).unwrap();
     check(&file_input(&at("v.mhd")), 0, 0);
+    // Without its end a pattern names as many slices as there are; without its start it begins at 1.
+    fs::write(at("v.mhd"), format!("{mha}HeaderSize = 2\nElementDataFile = s%02d.raw 3\n")).unwrap();
+    check(&file_input(&at("v.mhd")), 0, 0);
+    (0..4).for_each(|z| fs::write(at(&format!("t{}.raw", z + 1)), slice(z)).unwrap());
+    fs::write(at("v.mhd"), format!("{mha}ElementDataFile = t%d.raw\n")).unwrap();
+    check(&file_input(&at("v.mhd")), 0, 0);
+    // In its own file the voxels start where HeaderSize says, counted from the file's first byte.
+    let own = format!("{mha}HeaderSize = 300\nElementDataFile = LOCAL\n");
+    let padding = vec![b' '; 300 - own.len()];
+    fs::write(at("v.mha"), [own.into_bytes(), padding, all].concat()).unwrap();
+    check(&file_input(&at("v.mha")), 0, 0);
+}
+
+/// As other readers have it: more bytes than the header asks for are somebody's padding, a broken sum is not.
+#[test]
+fn bytes_after_the_voxels_of_packed_files_with_headers_are_no_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("v.nii.gz");
+    let mut plain = Vec::new();
+    flate2::read::GzDecoder::new(fs::File::open(data("nifti/time.nii.gz")).unwrap()).read_to_end(&mut plain).unwrap();
+    plain.extend([7; 5000]);
+    let packed = gzip(&plain);
+    fs::write(&path, &packed).unwrap();
+    let mut input = file_input(&path);
+    input.time = Select::Index(1);
+    let mut expect = fixture("nifti/time.nii.gz");
+    expect.time = Select::Index(1);
+    assert_eq!(whole(&input, 0).unwrap().1, whole(&expect, 0).unwrap().1);
+    let mut broken = packed.clone();
+    let sum = broken.len() - 8;
+    broken[sum] ^= 1;
+    fs::write(&path, &broken).unwrap();
+    assert!(whole(&input, 0).unwrap_err().to_string().contains("broken"), "a wrong checksum after the padding");
+}
+
+/// zarr-python writes what JSON does not know.
+#[test]
+fn bare_numbers_in_zarr_attributes_are_no_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let array = folder.path().join("a.zarr");
+    fs::create_dir_all(array.join("c/0/0")).unwrap();
+    let meta = r#"{"zarr_format":3,"node_type":"array","shape":[1,1,3],"data_type":"uint8","fill_value":0,
+        "chunk_grid":{"name":"regular","configuration":{"chunk_shape":[1,1,3]}},
+        "chunk_key_encoding":{"name":"default","configuration":{"separator":"/"}},
+        "codecs":[{"name":"bytes","configuration":{"endian":"little"}}],
+        "attributes":{"x":NaN,"lo":-Infinity,"hi":[Infinity, 1],"text":"\"NaN\" and \\"}}"#;
+    fs::write(array.join("zarr.json"), meta).unwrap();
+    fs::write(array.join("c/0/0/0"), [4, 5, 6]).unwrap();
+    assert_eq!(whole(&file_input(&array), 0).unwrap().1, Voxels::U8(vec![4, 5, 6]));
+    fs::write(array.join("zarr.json"), meta.replace("NaN,", "NaM,")).unwrap();
+    assert!(whole(&file_input(&array), 0).unwrap_err().to_string().contains("broken JSON"));
 }
 
 #[test]

@@ -8,7 +8,7 @@
 pub enum Level {
     /// What every x86-64 (and any other architecture) has.
     Baseline,
-    /// AVX2 with FMA.
+    /// AVX2 with FMA, BMI1, BMI2, LZCNT and POPCNT.
     Avx2,
     /// AVX-512 F, BW, DQ, VL and VBMI.
     Avx512,
@@ -19,7 +19,13 @@ impl Level {
     pub fn detect() -> Level {
         #[cfg(target_arch = "x86_64")]
         {
-            let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            // All that the functions of a level are compiled for: a hypervisor may hide some of it.
+            let avx2 = is_x86_feature_detected!("avx2")
+                && is_x86_feature_detected!("fma")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2")
+                && is_x86_feature_detected!("lzcnt")
+                && is_x86_feature_detected!("popcnt");
             let avx512 = is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512bw")
                 && is_x86_feature_detected!("avx512dq")

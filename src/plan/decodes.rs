@@ -63,11 +63,7 @@ fn chunked(plan: &Plan, group: &Group, w: WireId) -> Option<Chunked> {
     let wire = &plan.graph.wires[w];
     let Producer::Input(input) = wire.producer else { return None };
     let chunk = plan.input_chunks[input]?;
-    let reads = |s: &usize| plan.graph.steps[*s].inputs.contains(&w);
-    let masked = |s: &usize| plan.graph.steps[*s].mask.is_some();
-    if group.steps.iter().any(reads) && group.steps.iter().filter(|s| reads(s)).all(masked) {
-        return None; // what a mask leaves of it is read, nobody knows how much
-    }
+    // Nobody knows how much of it a mask leaves: as if everything were needed.
     let bytes = (chunk.iter().product::<usize>() * wire.components * wire.dtype.size()) as u64;
     let mut halo = input_halo(plan, group, w);
     let swept = group.steps.iter().map(|&s| &plan.graph.steps[s]).filter(|s| s.streamed == Some(w));

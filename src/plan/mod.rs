@@ -22,7 +22,7 @@ pub use brick::BrickChoice;
 pub use explain::explain;
 pub use flows::FlowPlan;
 pub use outputs::{MapPlan, OutputPlan};
-pub use tasks::{Group, Task};
+pub use tasks::Group;
 
 use crate::config::{Config, Device, Lanes};
 use crate::gpu::passes::Job;
@@ -83,6 +83,9 @@ pub struct Plan {
     pub flows: Vec<FlowPlan>,
 }
 
+/// Voxels read per voxel made from which a plan warns: bricks of half their halo read so many.
+const DEAR: f64 = 100.0;
+
 impl Plan {
     /// Plans a run of `config` on volumes with these facts (the config's inputs, in order). Opens no file.
     /// `find_gpu` is called at most once, when a GPU could be used.
@@ -123,6 +126,13 @@ impl Plan {
         }
         brick::chunks_fit(&plan, config)?;
         streams::choose(&mut plan, config)?;
+        let dear = plan.groups.iter().map(|g| g.brick.amplification).filter(|a| *a > DEAR).fold(0.0, f64::max);
+        if dear > 0.0 {
+            plan.warnings.push(format!(
+                "{dear:.0} voxels are read for each one that is made: bricks are small beside their halos in this budget; more \
+                 run.memory makes them larger"
+            ));
+        }
         fits::settle(&mut plan);
         if !plan.prepasses.is_empty() {
             let bricks: Vec<_> = plan.groups.iter().map(|g| brick::over_all(&plan, g, config)).collect();
@@ -297,20 +307,22 @@ fn placement(
         (_, Err(why)) => ("cpu", why.to_string()),
         (Some(Ok(gpu)), Ok(())) if exact && !gpu.exact_floats => ("cpu", facts::INEXACT.to_string()),
         (Some(Ok(gpu)), Ok(())) if of.close() && !gpu.close_floats => ("cpu", facts::ROUGH.to_string()),
-        (Some(Ok(gpu)), Ok(())) => match of.too_large(graph, gpu.buffer_cap(config.run.memory)) {
+        // Floats are the bits of the device that makes them: which one that is must not hang on the budget.
+        (Some(Ok(gpu)), Ok(())) => match of.too_large(graph, gpu.buffer_cap(of.budget(graph, config.run.memory))) {
             Some(why) => ("cpu", why.to_string()),
             None => ("gpu", gpu.name.clone()),
         },
         (Some(Err(why)), Ok(())) => ("cpu", format!("{NO_GPU}{why}")),
         (None, Ok(())) => unreachable!("a GPU is looked for where a step could use it"),
     };
-    let places: Placement = work
-        .into_iter()
-        .map(|(name, kernel, exact, of)| {
-            let (device, reason) = place(kernel, exact, of);
-            (name, device, reason)
-        })
-        .collect();
+    let mut places = Placement::new();
+    for (name, kernel, exact, of) in work {
+        let (device, reason) = place(kernel, exact, of);
+        if let (Some(Ok(gpu)), "gpu") = (&found, device) {
+            enough_for(gpu, config, graph, &name, of)?;
+        }
+        places.push((name, device, reason));
+    }
     let used = places.iter().any(|p| p.1 == "gpu");
     Ok((places, found.and_then(|f| f.ok()).filter(|_| used)))
 }
@@ -322,7 +334,35 @@ enum Work<'a> {
     Map(&'a OutputPlan),
 }
 
+/// Refuses a budget that leaves no buffers for a step of floats, which the device itself could hold.
+fn enough_for(gpu: &GpuFacts, config: &Config, graph: &Graph, name: &str, of: Work) -> Result<()> {
+    let memory = config.run.memory;
+    let fits = |memory: u64| of.too_large(graph, gpu.buffer_cap(memory)).is_none();
+    if fits(memory) {
+        return Ok(());
+    }
+    let mut enough = memory;
+    while !fits(enough) {
+        enough += enough / 16 + 1;
+    }
+    let message = format!(
+        "too little for {name} on the GPU, whose buffers a share of the budget bounds; give at least memory = \"{}MiB\", or \
+         device = \"cpu\" (whose floats have other last digits)",
+        enough.div_ceil(1 << 20)
+    );
+    Err(config.locate(Error::config("run.memory", message)))
+}
+
 impl Work<'_> {
+    /// The budget whose share of buffers decides the placement: the run's, or any where results are floats, which are one
+    /// device's.
+    fn budget(self, graph: &Graph, memory: u64) -> u64 {
+        match self {
+            Work::Step(step) if !floats(graph, step) => memory,
+            _ => u64::MAX,
+        }
+    }
+
     /// Whether it needs [`GpuFacts::close_floats`].
     fn close(self) -> bool {
         let Work::Step(step) = self else { return false };
@@ -373,7 +413,7 @@ fn no_such_gpu(config: &Config, why: &str) -> Error {
         "\"{name}\" was asked for, and no such GPU can be used: {why}; accepted here: \"cpu\", \"auto\" (the CPU where \
          there is no GPU) or \"{other}\" with such a driver"
     );
-    Error::Failed(config.locate(Error::config("run.device", message)).to_string())
+    Error::NoDevice(config.locate(Error::config("run.device", message)).to_string())
 }
 
 /// Windows of equal voxel radius on unequal spacing are long in space: say so.

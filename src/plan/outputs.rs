@@ -54,10 +54,16 @@ pub fn plan_outputs(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered
     (0..config.outputs.len())
         .map(|i| {
             let output = &config.outputs[i];
-            plan_output(config, infos, lowered, i)
-                .map_err(|e| config.locate(e).located(&config.file, output.place.line))
+            plan_output(config, infos, lowered, i).map_err(|e| of_output(config, output, e))
         })
         .collect()
+}
+
+/// Adds the line of the output's table to an error about one of its keys.
+fn of_output(config: &Config, output: &Output, error: Error) -> Error {
+    let error = config.locate(error);
+    let own = matches!(&error, Error::Config { key, .. } if key.starts_with(&output.place.key));
+    error.located(&config.file, output.place.line.filter(|_| own))
 }
 
 fn plan_output(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered, index: usize) -> Result<OutputPlan> {
@@ -253,17 +259,19 @@ fn region_of(config: &Config, shape: [usize; 3]) -> Result<Region> {
     Ok(region)
 }
 
+/// How cells of levels are made; refuses what the channels do not have.
 fn choose_reduce(output: &Output, used: &[&Wire], key: &str) -> Result<Reduce> {
     let all = |names: &[&str]| used.iter().all(|w| names.contains(&w.channel.as_str()));
+    let refuse = |what: &str| Err(Error::config(key, format!("{what}; accepted here: \"mean\" or \"stride\"")));
     match output.reduce {
         None => Ok(Reduce::Mean),
-        Some(Reduce::Min) if !all(&["min"]) => Err(Error::config(key, "\"min\" is for channels named min")),
-        Some(Reduce::Max) if !all(&["max"]) => Err(Error::config(key, "\"max\" is for channels named max")),
-        Some(Reduce::Moments) if all(&["variance", "std"]) && !all(&["variance"]) && !all(&["std"]) => Err(
-            Error::config(key, "\"moments\" is for variances or for standard deviations, not for both in one array"),
-        ),
+        Some(Reduce::Min) if !all(&["min"]) => refuse("\"min\" is for channels named min"),
+        Some(Reduce::Max) if !all(&["max"]) => refuse("\"max\" is for channels named max"),
+        Some(Reduce::Moments) if all(&["variance", "std"]) && !all(&["variance"]) && !all(&["std"]) => {
+            refuse("\"moments\" is for variances or for standard deviations, not for both in one array")
+        }
         Some(Reduce::Moments) if !all(&["variance"]) && !all(&["std"]) => {
-            Err(Error::config(key, "\"moments\" is for the channels variance and std"))
+            refuse("\"moments\" is for the channels variance and std")
         }
         Some(reduce) => Ok(reduce),
     }

@@ -54,14 +54,6 @@ pub struct Group {
     pub prepass: Option<BrickChoice>,
 }
 
-/// One super-block.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Task {
-    pub group: usize,
-    /// Voxels of the input volume.
-    pub region: Region,
-}
-
 impl Group {
     pub fn task_count(&self) -> usize {
         self.tasks.iter().fold(1, |all, &n| all.saturating_mul(n))

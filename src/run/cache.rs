@@ -4,6 +4,7 @@
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, Condvar, Mutex};
 
 use super::metrics::Metrics;
@@ -53,6 +54,8 @@ struct State {
     /// Bricks that will still read a chunk; absent = not counted yet.
     left: HashMap<Key, u32>,
     bytes: u64,
+    /// Bytes of chunks that are being decoded, packed and unpacked.
+    decoding: u64,
     clock: u64,
     /// Furthest place that was read for.
     front: u32,
@@ -84,11 +87,13 @@ impl ChunkCache {
 
     /// One chunk for one brick: from the cache, or decoded once even if several ask.
     pub fn get(&self, source: &Source, key: Key, future: Future, pool: &Pool, metrics: &Metrics) -> Result<Chunk> {
+        let takes = 2 * chunk_bytes(source);
         let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
         state.front = state.front.max(future.now);
         loop {
             state.clock += 1;
             let now = state.clock;
+            let busy = state.decoding > 0 && state.decoding + takes > AT_ONCE;
             match state.slots.get_mut(&key) {
                 Some(Slot::Ready { chunk, last, next, .. }) => {
                     (*last, *next) = (now, future.next);
@@ -97,13 +102,22 @@ impl ChunkCache {
                     return Ok(chunk);
                 }
                 Some(Slot::Loading) => state = self.loaded.wait(state).unwrap_or_else(|e| e.into_inner()),
+                None if busy => state = self.loaded.wait(state).unwrap_or_else(|e| e.into_inner()),
                 None => break,
             }
         }
         state.slots.insert(key, Slot::Loading);
+        state.decoding += takes;
         drop(state);
-        let loaded = load(source, key, pool, metrics);
+        // Readers that wait for the chunk must hear of a panic, too.
+        let loaded = catch_unwind(AssertUnwindSafe(|| load(source, key, pool, metrics)));
         let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
+        state.decoding -= takes;
+        let loaded = loaded.unwrap_or_else(|cause| {
+            state.slots.remove(&key);
+            self.loaded.notify_all();
+            resume_unwind(cause)
+        });
         let result = match loaded {
             Ok((chunk, bytes)) => {
                 let last = state.clock;
@@ -148,6 +162,7 @@ fn used(state: &mut State, key: Key, future: Future) {
     let left = state.left.entry(key).or_insert(uses);
     *left = left.saturating_sub(1);
     if *left == 0 {
+        state.left.remove(&key);
         remove(state, key);
     }
 }
@@ -156,6 +171,15 @@ fn remove(state: &mut State, key: Key) {
     if let Some(Slot::Ready { bytes, .. }) = state.slots.remove(&key) {
         state.bytes -= bytes;
     }
+}
+
+/// Bytes that chunks may take together while several are decoded, from as much again at worst: less than what one chunk may take
+/// beside the budget.
+const AT_ONCE: u64 = 64 << 20;
+
+fn chunk_bytes(source: &Source) -> u64 {
+    let info = source.info();
+    info.chunk.map_or(0, |c| c.iter().product::<usize>() * info.dtype.size()) as u64
 }
 
 fn load(source: &Source, key: Key, pool: &Pool, metrics: &Metrics) -> Result<(Chunk, u64)> {
@@ -181,7 +205,9 @@ fn load(source: &Source, key: Key, pool: &Pool, metrics: &Metrics) -> Result<(Ch
 #[derive(Debug, Clone)]
 pub struct Uses {
     chunk: Shape,
-    /// Per axis and chunk index along it: the intervals that touch it, half-open.
+    /// Chunk index along each axis of the first one that a brick may touch.
+    first: [i64; 3],
+    /// Per axis and chunk index along it, from there to the last: the intervals that touch it, half-open.
     touching: [Vec<(u32, u32)>; 3],
     /// Intervals per axis.
     counts: Shape,
@@ -193,15 +219,16 @@ const ABSENT: u32 = u32::MAX;
 
 impl Uses {
     /// `bricks` are the stream's bricks in order, grown by their halo and clipped.
-    pub fn new(bricks: &[Region], chunk: Shape, volume: Shape) -> Uses {
+    pub fn new(bricks: &[Region], chunk: Shape) -> Uses {
         let intervals: [Vec<(i64, i64)>; 3] = std::array::from_fn(|a| {
             let mut list: Vec<(i64, i64)> = bricks.iter().map(|b| (b.lo[a], b.hi[a])).collect();
             list.sort_unstable();
             list.dedup();
             list
         });
+        let all = bricks.iter().fold(Region::whole([0; 3]), |all, b| all.union(b)).cells([0; 3], chunk);
         let touching = std::array::from_fn(|a| {
-            let cells = 0..volume[a].div_ceil(chunk[a]) as i64;
+            let cells = all.lo[a]..all.hi[a];
             let (edge, list) = (chunk[a] as i64, &intervals[a]);
             let of = |c: i64| {
                 let first = list.partition_point(|i| i.1 <= c * edge);
@@ -215,13 +242,14 @@ impl Uses {
             let at: [usize; 3] = std::array::from_fn(|a| intervals[a].partition_point(|i| *i < (b.lo[a], b.hi[a])));
             order[(at[0] * counts[1] + at[1]) * counts[2] + at[2]] = place as u32;
         }
-        Uses { chunk, touching, counts, order }
+        Uses { chunk, first: all.lo, touching, counts, order }
     }
 
     /// The future of a chunk that the brick at place `now` reads.
     pub fn of(&self, chunk: [i64; 3], now: u32) -> Future {
         let (mut uses, mut next) = (0u32, ABSENT);
-        let [z, y, x] = std::array::from_fn(|a| self.touching[a].get(chunk[a] as usize).copied().unwrap_or((0, 0)));
+        let of = |a: usize| self.touching[a].get(usize::try_from(chunk[a] - self.first[a]).ok()?).copied();
+        let [z, y, x] = [0, 1, 2].map(|a| of(a).unwrap_or((0, 0)));
         for z in z.0..z.1 {
             for y in y.0..y.1 {
                 let row = (z as usize * self.counts[1] + y as usize) * self.counts[2];
@@ -256,7 +284,7 @@ mod tests {
             .collect();
         bricks.reverse();
         bricks.remove(4); // not every product of intervals is a brick
-        let uses = Uses::new(&bricks, chunk, volume.shape());
+        let uses = Uses::new(&bricks, chunk);
         for c in volume.cells([0; 3], chunk).iter() {
             let cell = Region::of_cell(c, [0; 3], chunk).clip(&volume);
             let readers: Vec<u32> =

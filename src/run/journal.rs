@@ -2,7 +2,7 @@
 //! before the next. A torn last line counts for nothing.
 
 use std::fs::{File, OpenOptions};
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
@@ -33,8 +33,8 @@ impl Journal {
     /// Reads what an earlier run left in `dir`; `None` where there is nothing usable.
     pub fn read(dir: &Path) -> Option<Earlier> {
         let header = serde_json::from_slice(&std::fs::read(dir.join(HEADER)).ok()?).ok()?;
-        let mut text = String::new();
-        File::open(dir.join(TASKS)).ok()?.read_to_string(&mut text).ok()?;
+        // Lines that a disk has broken count for nothing; the others still do.
+        let text = String::from_utf8_lossy(&std::fs::read(dir.join(TASKS)).ok()?).into_owned();
         let whole = &text[..text.rfind('\n').map_or(0, |i| i + 1)];
         let number = |line: &str| line.strip_prefix("done ").and_then(|n| n.strip_suffix(" ok")?.parse().ok());
         Some(Earlier { header, done: whole.lines().filter_map(number).collect() })
@@ -132,6 +132,7 @@ mod tests {
         let log = dir.path().join(TASKS);
         OpenOptions::new().append(true).open(&log).unwrap().write_all(b"done 1").unwrap(); // of `done 12 ok`
         assert_eq!(Journal::read(dir.path()).unwrap().done, [2]);
+        OpenOptions::new().append(true).open(&log).unwrap().write_all(b"\xff\xfe").unwrap();
         Journal::open(dir.path(), &head, true).unwrap().done(&[0]).unwrap();
         let earlier = Journal::read(dir.path()).unwrap();
         assert_eq!(earlier.done, [2, 0]);

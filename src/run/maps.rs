@@ -3,11 +3,12 @@
 use super::assemble::{Assembler, Item, Place, Target, TaskSlot, as_bytes};
 use super::compute::Finished;
 use super::value::Comp;
-use crate::brick::{Pool, Scratch};
+use crate::brick::{Pool, Scratch, Voxels};
 use crate::gpu::MapLevels;
 use crate::gpu::maps::MapCodes;
 use crate::grid::{AnyView, Region, View};
 use crate::kernel::Context;
+use crate::kernel::convert::convert_at;
 use crate::kernel::occlusion_map::{Moments, base, coarsen, needed};
 use crate::plan::{MapPlan, OutputPlan};
 use crate::{Error, Result};
@@ -26,8 +27,14 @@ pub fn assemble(
 ) -> Result<()> {
     let map = output.map.as_ref().expect("the caller saw a map");
     let last = output.brick_level();
-    let mut boxes = chain_boxes(output, map, done.brick);
     let mut cx = Context { level: assembler.level, scratch };
+    if let Comp::Const(stored) = done.value(map.source).comps[0] {
+        let moments = of_constant(assembler, map, stored);
+        if stays(map, last, moments, &mut cx) {
+            return uniform(assembler, index, output, target, moments, done.brick, slot, items);
+        }
+    }
+    let mut boxes = chain_boxes(output, map, done.brick);
     let made = on_gpu(assembler, index, output, target, map, done)?;
     if made.is_some() {
         (0..=last).for_each(|k| boxes[k] = output.level_box(k, done.brick));
@@ -139,8 +146,7 @@ fn base_level(assembler: &Assembler, output: &OutputPlan, map: &MapPlan, done: &
     match &value.comps[0] {
         Comp::Voxels(_) => base(value.view(0, part), wire.affine, wire.missing, &mut moments),
         Comp::Const(v) => {
-            let missing = v.is_nan() || wire.missing.is_some_and(|m| m as f64 == *v);
-            let (mean, variance) = if missing { (f64::NAN, f64::NAN) } else { (wire.affine.apply(*v), 0.0) };
+            let [mean, variance] = of_constant(assembler, map, *v);
             moments.mean.fill(mean);
             moments.variance.fill(variance);
         }
@@ -148,9 +154,75 @@ fn base_level(assembler: &Assembler, output: &OutputPlan, map: &MapPlan, done: &
     moments
 }
 
+/// Mean and variance of voxels of one stored value.
+fn of_constant(assembler: &Assembler, map: &MapPlan, stored: f64) -> [f64; 2] {
+    let wire = &assembler.plan.graph.wires[map.source];
+    let missing = stored.is_nan() || wire.missing.is_some_and(|m| m as f64 == stored);
+    if missing { [f64::NAN; 2] } else { [wire.affine.apply(stored), 0.0] }
+}
+
+/// Whether every level of a constant is that constant, bit for bit: asked of the kernel on volumes as small as have all the ends
+/// that the level's own has.
+fn stays(map: &MapPlan, last: usize, [mean, variance]: [f64; 2], cx: &mut Context) -> bool {
+    let same = |values: &[f64], v: f64| values.iter().all(|w| w.to_bits() == v.to_bits() || w.is_nan() && v.is_nan());
+    (1..=last).all(|k| {
+        let small = map.chain.levels[k - 1].shape.map(|n| n.min(8 + n % 2));
+        let halved = map.chain.levels[k].halved;
+        let coarse: [usize; 3] = std::array::from_fn(|a| if halved[a] { small[a].div_ceil(2) } else { small[a] });
+        let n = small.iter().product();
+        let fine = Moments { mean: vec![mean; n], variance: vec![variance; n] };
+        let mut made = Moments::default();
+        coarsen(&fine, Region::whole(small), small, halved, Region::whole(coarse), &mut made, cx);
+        same(&made.mean, mean) && same(&made.variance, variance)
+    })
+}
+
+/// Delivers a brick whose levels are all one constant.
+#[allow(clippy::too_many_arguments)]
+fn uniform(
+    assembler: &Assembler,
+    index: usize,
+    output: &OutputPlan,
+    target: &Target,
+    moments: [f64; 2],
+    brick: Region,
+    slot: &TaskSlot,
+    items: &mut Vec<Item>,
+) -> Result<()> {
+    let map = output.map.as_ref().expect("the caller saw a map");
+    let spec = target.sink.spec();
+    let mut fill = Voxels::zeroed(spec.dtype, 1);
+    fill.fill(spec.fill);
+    for k in map.first..=output.brick_level() {
+        let own = output.level_box(k, brick);
+        for (component, &which) in map.moments.iter().enumerate() {
+            let place = Place { index, output, target, component, slot };
+            let mut code = Voxels::zeroed(spec.dtype, 1);
+            let value = [moments[which]];
+            let view = AnyView::F64(View::dense(&value, [1; 3]));
+            convert_at(assembler.level, view, assembler.mapping(&place), code.view_mut([1; 3]));
+            if output.is_zarr() && code.as_bytes() == fill.as_bytes() {
+                assembler.put_fill(&place, k, own, spec.fill, items)?;
+                continue;
+            }
+            let mut voxels = assembler.pool.take(spec.dtype, own.voxels());
+            voxels.fill(code.at(0));
+            assembler.put(&place, k, own, voxels.view(own.shape()), items)?;
+            assembler.pool.put(voxels);
+        }
+    }
+    let own = output.level_box(output.brick_level(), brick);
+    if let Some(spill) = &target.cells {
+        for (plane, v) in moments.into_iter().enumerate() {
+            spill.write(plane, own, as_bytes(&vec![v; own.voxels()]));
+        }
+    }
+    Ok(())
+}
+
 /// Converts and puts the components of one level; `moments` cover `have`, of which `own` is stored.
 #[allow(clippy::too_many_arguments)]
-pub fn store(
+fn store(
     assembler: &Assembler,
     index: usize,
     output: &OutputPlan,
@@ -173,7 +245,7 @@ pub fn store(
 }
 
 /// The part `own` of values that cover `have`, densely packed.
-pub fn dense(values: &[f64], have: Region, own: Region) -> Vec<f64> {
+fn dense(values: &[f64], have: Region, own: Region) -> Vec<f64> {
     let view = View::dense(values, have.shape()).part(have.offset_of(&own), own.shape());
     let [nz, ny, _] = own.shape();
     (0..nz).flat_map(|z| (0..ny).flat_map(move |y| view.row_at(z, y).iter().copied())).collect()

@@ -20,6 +20,7 @@ pub struct Metrics {
     voxels_done: AtomicU64,
     bricks_computed: AtomicU64,
     bricks_resumed: AtomicU64,
+    voxels_resumed: AtomicU64,
     skipped: Mutex<BTreeMap<&'static str, u64>>,
     waits: Mutex<BTreeMap<&'static str, f64>>,
     steps: Vec<StepCounters>,
@@ -104,6 +105,7 @@ impl Metrics {
             voxels_done: AtomicU64::default(),
             bricks_computed: AtomicU64::default(),
             bricks_resumed: AtomicU64::default(),
+            voxels_resumed: AtomicU64::default(),
             skipped: Mutex::default(),
             waits: Mutex::default(),
             steps: (0..steps).map(|_| Default::default()).collect(),
@@ -147,6 +149,7 @@ impl Metrics {
 
     pub fn resumed(&self, bricks: u64, voxels: u64) {
         self.bricks_resumed.fetch_add(bricks, Relaxed);
+        self.voxels_resumed.fetch_add(voxels, Relaxed);
         self.bricks_done.fetch_add(bricks, Relaxed);
         self.voxels_done.fetch_add(voxels, Relaxed);
     }
@@ -251,7 +254,9 @@ impl Metrics {
     pub fn fill(&self, report: &mut super::Report, region_voxels: u64) {
         report.seconds = self.seconds();
         report.voxels = region_voxels;
-        report.voxels_per_second = region_voxels as f64 / report.seconds.max(1e-9);
+        // What an earlier run did took none of this one's time.
+        let made = region_voxels.saturating_sub(self.voxels_resumed.load(Relaxed));
+        report.voxels_per_second = made as f64 / report.seconds.max(1e-9);
         report.bricks.computed = self.bricks_computed.load(Relaxed);
         report.bricks.resumed = self.bricks_resumed.load(Relaxed);
         let skipped = self.skipped.lock().unwrap_or_else(|e| e.into_inner());

@@ -28,6 +28,7 @@ pub mod steps;
 pub mod stream;
 pub mod trace;
 mod uniform;
+mod unpack;
 pub mod value;
 pub mod windowed;
 mod windows;

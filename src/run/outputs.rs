@@ -11,7 +11,7 @@ use crate::grid::Region;
 use crate::kernel::reduce::planes;
 use crate::plan::{Group, OutputPlan, Plan};
 use crate::store::sink::{Claim, Existing, Sink, existing, remove_ours};
-use crate::store::{Spill, VolumeInfo};
+use crate::store::{Spill, VolumeInfo, os};
 use crate::{Error, Result};
 
 /// What is to be done with the outputs' paths as they are.
@@ -75,11 +75,8 @@ fn busy(config: &Config, output: &OutputPlan) -> Error {
 /// Decides by what lies at the outputs' paths. Deletes only what this program wrote.
 pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwrite: bool) -> Result<Start> {
     if overwrite {
-        // All are looked at before the first is deleted.
-        for output in &plan.outputs {
-            let found = existing(&output.spec.path);
-            refuse_foreign(config, output, &found)?;
-        }
+        refuse_foreigners(config, plan)?;
+        forget_tasks(plan)?;
         for output in &plan.outputs {
             clear(config, output)?;
         }
@@ -87,6 +84,7 @@ pub fn start(config: &Config, plan: &Plan, header: &Value, resume: bool, overwri
     }
     let found: Vec<Existing> = plan.outputs.iter().map(|o| existing(&o.spec.path)).collect();
     if found.iter().all(|f| matches!(f, Existing::None)) {
+        forget_tasks(plan)?;
         return Ok(Start::Afresh);
     }
     for (output, found) in plan.outputs.iter().zip(&found) {
@@ -134,10 +132,10 @@ fn make_others(config: &Config, plan: &Plan, found: &[Existing], complete: &[boo
             return Err(refused(config, output, &message));
         }
     }
+    forget_tasks(plan)?;
     for ((output, _), _) in others() {
         clear(config, output)?;
     }
-    journal::remove(&journal_dir(plan));
     match complete.contains(&true) {
         true => Ok(Start::Resume { done: Vec::new(), globals: Vec::new() }),
         false => Ok(Start::Afresh),
@@ -162,10 +160,27 @@ fn refused(config: &Config, output: &OutputPlan, what: &str) -> Error {
     place.error("path", format!("{} {what}", output.spec.path.display())).located(&config.file, place.line)
 }
 
+/// Removes all journals, durably, before anything goes that their tasks wrote: killed halfway, no task counts as done.
+fn forget_tasks(plan: &Plan) -> Result<()> {
+    for output in &plan.outputs {
+        let dir = Sink::work_dir(&output.spec.path);
+        journal::remove(&dir);
+        if dir.is_dir() {
+            os::sync_dir(&dir).map_err(|e| Error::file(&dir, format!("cannot remove the journal: {e}")))?;
+        }
+    }
+    Ok(())
+}
+
 fn clear(config: &Config, output: &OutputPlan) -> Result<()> {
     let found = existing(&output.spec.path);
     refuse_foreign(config, output, &found)?;
     remove_ours(&output.spec.path)
+}
+
+/// Refuses to overwrite what this program did not write: all are looked at before the first is deleted.
+pub fn refuse_foreigners(config: &Config, plan: &Plan) -> Result<()> {
+    plan.outputs.iter().try_for_each(|output| refuse_foreign(config, output, &existing(&output.spec.path)))
 }
 
 fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Result<()> {
@@ -176,7 +191,17 @@ fn refuse_foreign(config: &Config, output: &OutputPlan, found: &Existing) -> Res
 }
 
 /// Opens every output of a group that is not complete.
-pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], resume: bool) -> Result<Target> {
+///
+/// # Errors
+/// What tasks left in scratch (`begun`: some are done) is gone, or a file cannot be made.
+pub fn open_target(
+    plan: &Plan,
+    group: &Group,
+    o: usize,
+    globals: &[Vec<f64>],
+    resume: bool,
+    begun: bool,
+) -> Result<Target> {
     let output = &plan.outputs[o];
     let range = output.mapped(globals);
     let mut spec = output.spec.clone();
@@ -187,17 +212,21 @@ pub fn open_target(plan: &Plan, group: &Group, o: usize, globals: &[Vec<f64>], r
     let dir = Sink::work_dir(&output.spec.path);
     let parts = output.spec.components.unwrap_or(1);
     let mut levels = Vec::new();
+    let open = |name: String, shape, planes, item| {
+        let path = dir.join(name);
+        if begun { Spill::reopen(&path, shape, planes, item) } else { Spill::open(&path, shape, planes, item) }
+    };
     for k in 0..=output.brick_level() {
         let shared = output.is_zarr() && k >= output.first_level() && !output.owned(k, group);
         let shape = output.level(k).expect("level exists").shape;
-        let open = || Spill::open(&dir.join(format!("level.{k}")), shape, parts, output.spec.dtype.size());
-        levels.push(shared.then(open).transpose()?);
+        let level = || open(format!("level.{k}"), shape, parts, output.spec.dtype.size());
+        levels.push(shared.then(level).transpose()?);
     }
     let deepest = output.brick_level();
     let cells = (output.level_count() - 1 > deepest).then(|| {
         let per_cell = if output.map.is_some() { 2 } else { parts * planes(output.reduce) };
         let shape = output.level(deepest).expect("level exists").shape;
-        Spill::open(&dir.join(format!("cells.{deepest}")), shape, per_cell, size_of::<f64>())
+        open(format!("cells.{deepest}"), shape, per_cell, size_of::<f64>())
     });
     Ok(Target { sink, levels, cells: cells.transpose()?, range })
 }

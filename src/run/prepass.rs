@@ -6,6 +6,7 @@ use super::compute::Finished;
 use super::sketch::Sketch;
 use super::value::Comp;
 use crate::grid::{AnyView, Region, Shape, Voxel};
+use crate::kernel::values::missing_as;
 use crate::plan::graph::WireId;
 use crate::plan::{Plan, Prepass, PrepassKind};
 
@@ -90,7 +91,8 @@ impl MinMax {
 
 /// Least and largest stored value of a view, or `None` where nothing counts.
 fn extremes(view: AnyView, missing: Option<i64>) -> Option<[f64; 2]> {
-    fn run<T: Voxel>(v: crate::grid::View<T>, missing: Option<T>) -> Option<[f64; 2]> {
+    fn run<T: Voxel>(v: crate::grid::View<T>, missing: Option<i64>) -> Option<[f64; 2]> {
+        let missing = missing_as::<T>(missing);
         let mut found: Option<[T; 2]> = None;
         for i in Region::new([0; 3], [v.shape[0] as i64, v.shape[1] as i64, 1]).iter() {
             for &x in v.row_at(i[0] as usize, i[1] as usize) {
@@ -105,9 +107,5 @@ fn extremes(view: AnyView, missing: Option<i64>) -> Option<[f64; 2]> {
         }
         found.map(|f| f.map(T::to_f64))
     }
-    crate::with_view!(AnyView, view, v => run(v, missing.map(|m| cast_like(v.data, m))))
-}
-
-fn cast_like<T: Voxel>(_: &[T], value: i64) -> T {
-    T::from_f64(value as f64)
+    crate::with_view!(AnyView, view, v => run(v, missing))
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::assemble::{Target, as_bytes};
-use super::maps::dense;
+use super::cancel::Cancel;
 use crate::Result;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{AnyView, DType, Region, View};
@@ -18,19 +18,25 @@ use crate::kernel::simd::Level;
 use crate::plan::OutputPlan;
 use crate::store::Spill;
 
-/// Finishes all levels of one output. Idempotent: a killed second phase is simply done again.
-pub fn finish_levels(output: &OutputPlan, target: &Target, work_dir: &Path, pool: &rayon::ThreadPool) -> Result<u64> {
+/// Finishes all levels of one output. Idempotent: a second phase that was killed or cancelled is simply done again.
+pub fn finish_levels(
+    output: &OutputPlan,
+    target: &Target,
+    work_dir: &Path,
+    pool: &rayon::ThreadPool,
+    cancel: &Cancel,
+) -> Result<u64> {
     pool.install(|| {
         let mut bytes = 0;
         for k in output.first_level()..=output.brick_level() {
             if let Some(spill) = &target.levels[k] {
-                bytes += shared_level(output, target, spill, k)?;
+                bytes += shared_level(output, target, spill, k, cancel)?;
             }
         }
         let mut fine = None;
         for k in output.brick_level() + 1..output.level_count() {
             let spill = fine.as_ref().or(target.cells.as_ref()).expect("cells were kept for the levels beyond");
-            let (written, next) = coarse_level(output, target, spill, work_dir, k)?;
+            let (written, next) = coarse_level(output, target, spill, work_dir, k, cancel)?;
             bytes += written;
             fine = Some(next);
         }
@@ -50,9 +56,10 @@ fn components(output: &OutputPlan) -> usize {
 }
 
 /// Encodes a level whose rounded voxels tasks left in scratch.
-fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize) -> Result<u64> {
+fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize, cancel: &Cancel) -> Result<u64> {
     let dataset = k - output.first_level();
     let one = |(component, region): (usize, Region)| {
+        cancel.check()?;
         let mut voxels = Voxels::zeroed(output.spec.dtype, region.voxels());
         spill.read(component, region, voxels.as_bytes_mut());
         let chunk = target.sink.encode(dataset, region, voxels.view(region.shape()))?;
@@ -66,16 +73,26 @@ fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize) -
 }
 
 /// Makes level `k` from the cells of level `k - 1`; returns the bytes written and the cells of level `k`.
-fn coarse_level(output: &OutputPlan, target: &Target, fine: &Spill, work_dir: &Path, k: usize) -> Result<(u64, Spill)> {
+fn coarse_level(
+    output: &OutputPlan,
+    target: &Target,
+    fine: &Spill,
+    work_dir: &Path,
+    k: usize,
+    cancel: &Cancel,
+) -> Result<(u64, Spill)> {
     let layout = output.level(k).expect("level exists");
     let per_component = if output.map.is_some() { 2 } else { components(output) * planes(output.reduce) };
     let next = Spill::open(&work_dir.join(format!("cells.{k}")), layout.shape, per_component, size_of::<f64>())?;
     let regions = chunks(output, k);
     let bytes = regions
         .into_par_iter()
-        .map(|region| match output.map {
-            Some(_) => map_chunk(output, target, fine, &next, k, region),
-            None => cells_chunk(output, target, fine, &next, k, region),
+        .map(|region| {
+            cancel.check()?;
+            match output.map {
+                Some(_) => map_chunk(output, target, fine, &next, k, region),
+                None => cells_chunk(output, target, fine, &next, k, region),
+            }
         })
         .try_reduce(|| 0, |a, b| Ok(a + b))?;
     target.sink.commit(k - output.first_level(), Region::whole(layout.shape))?;
@@ -176,6 +193,9 @@ fn cells_slab(
     rounded
 }
 
+/// Cells of an occlusion map that are made at a time: with their surroundings a chunk of 64^3 would take 36 MiB on every thread.
+const MAP_CELLS: usize = 1 << 15;
+
 /// One chunk of an occlusion map's chain.
 fn map_chunk(
     output: &OutputPlan,
@@ -187,22 +207,36 @@ fn map_chunk(
 ) -> Result<u64> {
     let map = output.map.as_ref().expect("the caller saw a map");
     let (layout, below) = (&map.chain.levels[k], &map.chain.levels[k - 1]);
-    let from = needed(region, layout.halved, below.shape);
-    let source = Moments { mean: read_plane(fine, 0, from), variance: read_plane(fine, 1, from) };
+    let [_, ny, nx] = region.shape();
+    // Two planes above and below are seen by each slab.
+    let planes = (MAP_CELLS / (ny * nx)).max(4) as i64;
     let mut scratch = Scratch::new();
     let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
     let mut made = Moments::default();
-    coarsen(&source, from, below.shape, layout.halved, region, &mut made, &mut cx);
-    let mut bytes = 0;
-    for (component, &which) in map.moments.iter().enumerate() {
-        let values = if which == 0 { &made.mean } else { &made.variance };
-        let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
-        let view = AnyView::F64(View::dense(values, region.shape()));
-        convert_at(Level::detect(), view, output.mapping(component, target.range), rounded.view_mut(region.shape()));
-        bytes += store(output, target, k, component, region, &rounded)?;
+    let size = output.spec.dtype.size();
+    let mut rounded: Vec<Voxels> =
+        map.moments.iter().map(|_| Voxels::zeroed(output.spec.dtype, region.voxels())).collect();
+    for lo in (region.lo[0]..region.hi[0]).step_by(planes as usize) {
+        let hi = (lo + planes).min(region.hi[0]);
+        let slab = Region::new([lo, region.lo[1], region.lo[2]], [hi, region.hi[1], region.hi[2]]);
+        let from = needed(slab, layout.halved, below.shape);
+        let source = Moments { mean: read_plane(fine, 0, from), variance: read_plane(fine, 1, from) };
+        coarsen(&source, from, below.shape, layout.halved, slab, &mut made, &mut cx);
+        let start = (lo - region.lo[0]) as usize * ny * nx;
+        for ((component, &which), rounded) in map.moments.iter().enumerate().zip(&mut rounded) {
+            let values = if which == 0 { &made.mean } else { &made.variance };
+            let mut part = Voxels::zeroed(output.spec.dtype, slab.voxels());
+            let view = AnyView::F64(View::dense(values, slab.shape()));
+            convert_at(Level::detect(), view, output.mapping(component, target.range), part.view_mut(slab.shape()));
+            rounded.as_bytes_mut()[start * size..][..slab.voxels() * size].copy_from_slice(part.as_bytes());
+        }
+        for (plane, values) in [&made.mean, &made.variance].into_iter().enumerate() {
+            next.write(plane, slab, as_bytes(values));
+        }
     }
-    for (plane, values) in [&made.mean, &made.variance].into_iter().enumerate() {
-        next.write(plane, region, as_bytes(&dense(values, region, region)));
+    let mut bytes = 0;
+    for (component, rounded) in rounded.iter().enumerate() {
+        bytes += store(output, target, k, component, region, rounded)?;
     }
     Ok(bytes)
 }

@@ -1,8 +1,7 @@
 //! A run as library calls: open, `run_task(i)` in any order, finish.
 
-use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Instant;
 
 use serde_json::{Value, json};
 
@@ -21,6 +20,7 @@ use super::report::{self, Report};
 use super::steps::Engine;
 use super::stream::{Stream, Work};
 use super::trace::Trace;
+use super::unpack::unpack;
 use super::{planned, second, windows};
 use crate::brick::{Pool, Scratch};
 use crate::config::{Config, config_hash};
@@ -28,11 +28,8 @@ use crate::gpu::Gpu;
 use crate::grid::{Region, order::morton};
 use crate::plan::{BrickChoice, Group, Plan, decodes};
 use crate::store::sink::{Claim, Sink};
-use crate::store::{Source, VolumeInfo, changed_by, named_files, open_inputs, said_of};
+use crate::store::{Source, VolumeInfo, changed_by, named_files, open_inputs};
 use crate::{Error, Result};
-
-/// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
-const QUIET_UNPACK: u64 = 64 << 20;
 
 /// Turns a finished brick into chunks.
 type Deliver<'d> = dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync + 'd;
@@ -53,15 +50,18 @@ pub struct Session<'a> {
     journal: Option<Journal>,
     /// Kept until the session ends: no other run may write the outputs.
     _claims: Vec<Option<Claim>>,
-    done: Vec<bool>,
+    done: Vec<AtomicBool>,
     globals: Vec<Vec<f64>>,
     threads: rayon::ThreadPool,
     pool: Pool,
     metrics: Metrics,
     trace: Trace,
     /// Folders to remove at the end.
-    scratch: Option<PathBuf>,
     last_tick: AtomicU64,
+}
+
+fn is_done(task: &AtomicBool) -> bool {
+    task.load(Ordering::Acquire)
 }
 
 impl<'a> Session<'a> {
@@ -105,6 +105,12 @@ impl<'a> Session<'a> {
         let mut header = journal::header(&hash, &identities, plan.task_count(), &json!(plan.held), &[]);
         header["reasons"] = planned::reasons(&plan);
         let mut claims = outputs::claim_begun(config, &plan)?;
+        let metrics = Metrics::new(plan.graph.steps.len(), plan.flows.len());
+        if options.overwrite {
+            // Before the old result goes: a broken input must not cost it.
+            outputs::refuse_foreigners(config, &plan)?;
+            unpack(&mut sources, config, options, progress, &metrics)?;
+        }
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
         if start != Start::Complete {
             outputs::claim_all(config, &plan, &mut claims)?;
@@ -119,7 +125,7 @@ impl<'a> Session<'a> {
             config,
             options,
             progress,
-            metrics: Metrics::new(plan.graph.steps.len(), plan.flows.len()),
+            metrics,
             targets: plan.outputs.iter().map(|_| None).collect(),
             plan,
             gpu,
@@ -129,12 +135,11 @@ impl<'a> Session<'a> {
             sources,
             journal: None,
             _claims: claims,
-            done: vec![false; tasks],
+            done: (0..tasks).map(|_| AtomicBool::new(false)).collect(),
             globals: Vec::new(),
             threads,
             pool: Pool::default(),
             trace: Trace::new(options.trace.is_some()),
-            scratch: None,
             last_tick: AtomicU64::new(0),
         };
         session.prepare(start, header)?;
@@ -144,7 +149,8 @@ impl<'a> Session<'a> {
     fn prepare(&mut self, start: Start, mut header: Value) -> Result<()> {
         let resume = match start {
             Start::Complete => {
-                self.done.fill(true);
+                self.done.iter_mut().for_each(|d| *d = true.into());
+                self.plan.groups.iter().for_each(|g| self.count_resumed(g));
                 journal::remove(&outputs::journal_dir(&self.plan));
                 return self.plan.outputs.iter().try_for_each(|o| o.spec.forget_work());
             }
@@ -152,15 +158,16 @@ impl<'a> Session<'a> {
             Start::Resume { done, globals } => {
                 for task in done {
                     if let Some(flag) = self.done.get_mut(task) {
-                        *flag = true;
+                        *flag = true.into();
                     }
                 }
                 self.globals = globals;
                 true
             }
         };
-        if self.done.contains(&false) || self.globals.len() < self.plan.prepasses.len() {
-            self.unpack()?;
+        let open = !self.done.iter().all(is_done) || self.globals.len() < self.plan.prepasses.len();
+        if open && !self.options.overwrite {
+            unpack(&mut self.sources, self.config, self.options, self.progress, &self.metrics)?;
         }
         for id in self.globals.len()..self.plan.prepasses.len() {
             let found = self.prepass(id)?;
@@ -170,7 +177,9 @@ impl<'a> Session<'a> {
         for g in 0..self.plan.groups.len() {
             for &o in &self.plan.groups[g].outputs {
                 if !resume || !outputs::is_complete(&self.plan, o, &header) {
-                    let target = outputs::open_target(&self.plan, &self.plan.groups[g], o, &self.globals, resume)?;
+                    let group = &self.plan.groups[g];
+                    let begun = self.done[group.first_task..][..group.task_count()].iter().any(is_done);
+                    let target = outputs::open_target(&self.plan, group, o, &self.globals, resume, begun)?;
                     self.targets[o] = Some(target);
                 } else if o + 1 < self.plan.outputs.len() {
                     // The last one's folder holds the journal.
@@ -179,40 +188,12 @@ impl<'a> Session<'a> {
             }
             let group = &self.plan.groups[g];
             if group.outputs.iter().all(|&o| self.targets[o].is_none()) {
-                self.done[group.first_task..][..group.task_count()].fill(true);
+                self.done[group.first_task..][..group.task_count()].iter_mut().for_each(|d| *d = true.into());
             }
         }
         self.journal = Some(Journal::open(&outputs::journal_dir(&self.plan), &header, resume)?);
+        self.plan.groups.iter().for_each(|g| self.count_resumed(g));
         Ok(())
-    }
-
-    /// Unpacks gzip and re-blocks compressed planes, once, into scratch.
-    fn unpack(&mut self) -> Result<()> {
-        let total: u64 = self.sources.iter().map(Source::spool_bytes).sum();
-        let first = &self.config.outputs[0].path;
-        let beside = first.parent().map_or_else(|| PathBuf::from("."), PathBuf::from);
-        let base = self.config.run.scratch.clone().unwrap_or(beside);
-        let dir = base.join(format!(".occlude-scratch-{}", std::process::id()));
-        if total > 0 {
-            std::fs::create_dir_all(&dir).map_err(|e| Error::file(&dir, format!("cannot create scratch: {e}")))?;
-            self.scratch = Some(dir.clone());
-        }
-        for (source, input) in self.sources.iter_mut().zip(&self.config.inputs) {
-            let cancel = &self.options.cancel;
-            let prepared = source.prepare(&dir, &|bytes| {
-                if total > QUIET_UNPACK {
-                    self.progress.update(bytes, total, 0, 0, "unpack");
-                }
-                !cancel.is_cancelled()
-            });
-            prepared.map_err(|e| said_of(self.config, &input.name, e))?;
-            self.metrics.bytes_read(source.unpacked_bytes());
-        }
-        // What was unpacked has no name any more; nothing stays behind, whatever happens.
-        if let Some(dir) = self.scratch.take() {
-            let _ = std::fs::remove_dir(dir);
-        }
-        self.options.cancel.check()
     }
 
     pub fn plan(&self) -> &Plan {
@@ -232,19 +213,26 @@ impl<'a> Session<'a> {
                 let [_, ny, nx] = group.tasks;
                 morton([t / (ny * nx), t / nx % ny, t % nx].map(|v| v as i64))
             });
-            tasks.extend(own.into_iter().map(|t| t + group.first_task).filter(|&t| !self.done[t]));
+            tasks.extend(own.into_iter().map(|t| t + group.first_task).filter(|&t| !is_done(&self.done[t])));
         }
         tasks
     }
 
-    /// Runs one task by number. Idempotent; disjoint from every other task.
+    /// Runs one task by number; one that is done already is not done again. Disjoint from every other task.
     pub fn run_task(&self, task: usize) -> Result<()> {
         self.run_tasks(&[task])
     }
 
-    /// Streams the bricks of these tasks, group by group, marking each task as it finishes.
+    /// Streams the bricks of those of these tasks that are not done, group by group, marking each task as it finishes.
+    ///
+    /// # Errors
+    /// There is no such task, or one failed.
     pub fn run_tasks(&self, tasks: &[usize]) -> Result<()> {
-        self.run_bricks(tasks, None)
+        if let Some(task) = tasks.iter().find(|t| **t >= self.done.len()) {
+            return Err(Error::Failed(format!("there is no task {task} among {}", self.done.len())));
+        }
+        let open: Vec<usize> = tasks.iter().copied().filter(|&t| !is_done(&self.done[t])).collect();
+        self.run_bricks(&open, None)
     }
 
     /// Streams only the bricks that meet one of these boxes of the volume. No task counts as done, and what was written is
@@ -257,7 +245,6 @@ impl<'a> Session<'a> {
         for (g, group) in self.plan.groups.iter().enumerate() {
             let own = |t: &usize| (group.first_task..group.first_task + group.task_count()).contains(t);
             let mine: Vec<usize> = tasks.iter().copied().filter(own).collect();
-            self.count_resumed(group);
             if !mine.is_empty() {
                 self.stream_group(g, &mine, only)?;
             }
@@ -265,9 +252,10 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
+    /// Counts what an earlier run did.
     fn count_resumed(&self, group: &Group) {
         for t in 0..group.task_count() {
-            if self.done[group.first_task + t] {
+            if is_done(&self.done[group.first_task + t]) {
                 let region = group.task_region(t);
                 self.metrics.resumed(group.bricks(region).len() as u64, region.voxels() as u64);
             }
@@ -304,6 +292,9 @@ impl<'a> Session<'a> {
             let (bricks, voxels) = self.metrics.done();
             self.tick(&group.brick, [voxels, self.plan.voxels(), bricks, total], "compute");
         };
+        // From here the rate counts.
+        let (bricks, voxels) = self.metrics.done();
+        self.progress.update(voxels, self.plan.voxels(), bricks, total, "compute");
         let streamed = self.stream(&engine, &program, &group.brick, &work, &self.metrics, &deliver, &write, &tick);
         // What was finished is kept, whatever ended the stream; the first error is the one to tell.
         streamed.and(commits.settle(commit))
@@ -325,22 +316,28 @@ impl<'a> Session<'a> {
         Ok(slot.written())
     }
 
-    /// Makes tasks durable, and marks them where they are `whole`.
+    /// Makes tasks durable, and marks them where they are `whole`: those before one that fails, too.
     fn commit(&self, group: &Group, tasks: &[(usize, Region)], whole: bool) -> Result<()> {
         let start = Instant::now();
-        for &(_, region) in tasks {
-            for &o in &group.outputs {
-                if let Some(target) = &self.targets[o] {
-                    outputs::commit_task(group, &self.plan.outputs[o], target, region)?;
-                }
+        let durable = |region: Region| {
+            let open = group.outputs.iter().filter_map(|&o| Some((&self.plan.outputs[o], self.targets[o].as_ref()?)));
+            open.into_iter().try_for_each(|(output, target)| outputs::commit_task(group, output, target, region))
+        };
+        let mut numbers = Vec::new();
+        let mut failed = Ok(());
+        for &(task, region) in tasks {
+            failed = durable(region);
+            if failed.is_err() {
+                break;
             }
+            numbers.push(task);
         }
-        let numbers: Vec<usize> = tasks.iter().map(|t| t.0).collect();
-        if let Some(journal) = self.journal.as_ref().filter(|_| whole) {
+        if let Some(journal) = self.journal.as_ref().filter(|_| whole && !numbers.is_empty()) {
             journal.done(&numbers)?;
+            numbers.iter().for_each(|&t| self.done[t].store(true, Ordering::Release));
         }
         self.trace.span("commit", start, &[("tasks", format!("{numbers:?}"))]);
-        Ok(())
+        failed
     }
 
     /// What a pre-pass finds over the whole volume.
@@ -419,7 +416,7 @@ impl<'a> Session<'a> {
             let volume = self.infos[input].shape;
             let grown: Vec<Region> =
                 work.iter().map(|w| crate::plan::memory::wire_box(w.brick, halo, volume)).collect();
-            Some(Uses::new(&grown, chunk, volume))
+            Some(Uses::new(&grown, chunk))
         };
         (0..self.sources.len()).map(by_input).collect()
     }
@@ -440,12 +437,16 @@ impl<'a> Session<'a> {
 
     /// The second phase and the attributes; then the outputs are complete.
     pub fn finish(mut self) -> Result<Report> {
+        let open = self.done.iter().filter(|d| !is_done(d)).count();
+        if open > 0 {
+            return Err(Error::Failed(format!("{open} of {} tasks are not done", self.done.len())));
+        }
         let start = Instant::now();
         for o in 0..self.plan.outputs.len() {
             let Some(target) = self.targets[o].take() else { continue };
             let output = &self.plan.outputs[o];
             let dir = Sink::work_dir(&output.spec.path);
-            let bytes = second::finish_levels(output, &target, &dir, &self.threads)?;
+            let bytes = second::finish_levels(output, &target, &dir, &self.threads, &self.options.cancel)?;
             self.metrics.bytes_written(bytes);
             let attributes = outputs::attributes(
                 self.config,
@@ -491,19 +492,6 @@ impl<'a> Session<'a> {
     pub fn lose_gpu(&self, for_good: bool) {
         if let Some(gpu) = &self.gpu {
             gpu.lose(for_good);
-        }
-    }
-
-    /// Wall time since the run was opened.
-    pub fn elapsed(&self) -> Duration {
-        Duration::from_secs_f64(self.metrics.seconds())
-    }
-}
-
-impl Drop for Session<'_> {
-    fn drop(&mut self) {
-        if let Some(dir) = &self.scratch {
-            let _ = std::fs::remove_dir_all(dir);
         }
     }
 }

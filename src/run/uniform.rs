@@ -80,7 +80,14 @@ impl Assembler<'_> {
     }
 
     /// As [`Assembler::put`], of a box of the fill value.
-    fn put_fill(&self, place: &Place, k: usize, region: Region, fill: f64, items: &mut Vec<Item>) -> Result<()> {
+    pub(super) fn put_fill(
+        &self,
+        place: &Place,
+        k: usize,
+        region: Region,
+        fill: f64,
+        items: &mut Vec<Item>,
+    ) -> Result<()> {
         let (output, sink) = (place.output, &place.target.sink);
         let dataset = k - output.first_level();
         let whole = Region::whole(output.level(k).expect("level exists").shape);

@@ -38,6 +38,21 @@ pub struct Spill {
 }
 
 impl Spill {
+    /// Opens an array that an earlier run filled in part.
+    ///
+    /// # Errors
+    /// It is not there, or of another size.
+    pub fn reopen(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<Spill> {
+        let wanted = shape.iter().fold((planes * item) as u64, |n, &s| n.saturating_mul(s as u64)).max(1);
+        match std::fs::metadata(path) {
+            Ok(m) if m.is_file() && m.len() == wanted => Spill::open(path, shape, planes, item),
+            _ => {
+                let message = "what the finished tasks left here for later levels is gone or was changed; --overwrite starts afresh";
+                Err(Error::file(path, message))
+            }
+        }
+    }
+
     /// Opens or creates the array. An existing file of the right size keeps its contents.
     pub fn open(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<Spill> {
         let fail = |what: &str, e: std::io::Error| Error::file(path, format!("cannot {what} scratch: {e}"));
@@ -114,7 +129,11 @@ mod tests {
         spill.write(1, region, &bytes);
         spill.flush().unwrap();
         drop(spill);
-        let again = Spill::open(&path, [3, 2, 5], 2, 2).unwrap();
+        assert!(
+            Spill::reopen(&path, [3, 2, 6], 2, 2).is_err()
+                && Spill::reopen(&dir.path().join("x"), [1; 3], 1, 1).is_err()
+        );
+        let again = Spill::reopen(&path, [3, 2, 5], 2, 2).unwrap();
         let mut out = vec![9; 16];
         again.read(1, region, &mut out);
         assert_eq!(out, bytes);

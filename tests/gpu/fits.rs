@@ -103,3 +103,17 @@ fn a_sweep_that_would_read_too_much_runs_on_the_cpu_and_the_plan_says_how_much()
     assert_eq!(device, "cpu");
     assert!(why.contains("voxels for each of a brick, of at most 4") && why.ends_with("runs on the CPU"), "{why}");
 }
+
+/// Floats are the bits of the device that makes them: a budget may be refused, never move them.
+#[test]
+fn a_budget_does_not_move_floats_to_the_cpu() {
+    let text = "[input.vol]\nsynthetic = \"noise\"\nshape = [96, 96, 96]\ndtype = \"f32\"\n[stage.stats]\nop = \"box\"\n\
+                input = \"vol\"\nradius = 40\n[output.o]\npath = \"out/o.zarr\"\nfrom = \"stats.variance\"\n";
+    let dir = folder([2, 2, 2]);
+    assert_eq!(place(&plan(dir.path(), text, &["run.memory='2GiB'"]), "stats").0, "gpu");
+    let little = plan_with(dir.path(), text, &[lane(), LITTLE], Ok(found()));
+    let error = little.expect_err("too little for a window").to_string();
+    assert!(error.contains("run.memory") && error.contains("give at least memory = "), "{error}");
+    let enough = error.split("memory = \"").nth(1).and_then(|rest| rest.split('"').next()).unwrap();
+    assert_eq!(place(&plan(dir.path(), text, &[&format!("run.memory='{enough}'")]), "stats").0, "gpu");
+}

@@ -3,8 +3,9 @@
 //! Over a full window the regression's normal equations are diagonal, so each component is
 //! `sum_k w_k f_k x_k / sum_k w_k x_k^2`. The weights depend on `|x_k|` only: voxels that mirror each other share one, and
 //! are subtracted or added before they are weighed. Along y and z that happens on whole rows (in i32 for types of up to 16
-//! bits, which is exact), along x in registers. No fused operations: on a CPU that has them they save little here, and one
-//! that has not would pay fifty times over.
+//! bits, which is exact). Along x weighed columns are subtracted, which loses less than an f32 result shows for types whose values
+//! an f32 or an i16 holds; of wider types mirrored voxels are subtracted first, so that an offset of all values cancels there, too.
+//! No fused operations: on a CPU that has them they save little here, and one that has not would pay fifty times over.
 
 mod gaps;
 pub mod shared;
@@ -232,6 +233,9 @@ fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
                     weigh::<H, T, S>(&rows, missing, job.table, m, sums);
                 }
                 join_columns::<H>(sums, parts);
+                if matches!(T::DTYPE, DType::U32 | DType::I32 | DType::F64) {
+                    across::<H, T>(&rows, missing, job.table, n, &mut parts[2 * RUN..]);
+                }
                 if gaps && any_nan(&rows[H][H][H..H + n], missing, n, parts) {
                     gaps::regress_gaps::<H, T>(job.level, &rows, missing, n, job.table, parts);
                 }
@@ -332,6 +336,31 @@ fn minus<T, S: Sum<T>>(a: &[S; LANES], b: &[S; LANES]) -> [S; LANES] {
     std::array::from_fn(|l| a[l].minus(b[l]))
 }
 
+/// Component x of `n` voxels from differences of mirrored voxels.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // offsets index weights and rows alike
+fn across<const H: usize, T: Voxel>(
+    rows: &[[&[T]; 5]; 5],
+    missing: Option<T>,
+    table: &Table,
+    n: usize,
+    gx: &mut [f64],
+) {
+    let gx = &mut gx[..n];
+    gx.fill(0.0);
+    for dz in 0..=2 * H {
+        for dy in 0..=2 * H {
+            for dx in 1..=H {
+                let w = table.along[2][dz.abs_diff(H)][dy.abs_diff(H)][dx];
+                let (before, behind) = (&rows[dz][dy][H - dx..][..n], &rows[dz][dy][H + dx..][..n]);
+                for i in 0..n {
+                    gx[i] += w * (<f64 as Sum<T>>::of(behind[i], missing) - <f64 as Sum<T>>::of(before[i], missing));
+                }
+            }
+        }
+    }
+}
+
 /// The three components (z, y, x in turn, [`RUN`] apart) from the weighted columns; past the run's end they are rubbish.
 #[inline(always)]
 fn join_columns<const H: usize>(sums: &[f64], parts: &mut [f64]) {
@@ -376,6 +405,24 @@ fn any_nan<T: Voxel>(centres: &[T], missing: Option<T>, n: usize, parts: &[f64])
     any
 }
 
+/// Whether a component's square may overflow or lose digits.
+#[inline(always)]
+fn is_far(g: f64) -> bool {
+    g.abs() > 1e150 || (g.abs() < 1e-140 && g != 0.0)
+}
+
+/// Length of a vector whose squares may be no f64: scaled by a power of two, so that others keep their bits.
+fn far_length(g: [f64; 3]) -> f64 {
+    let largest = g.iter().fold(0.0, |m: f64, g| m.max(g.abs()));
+    let by = match largest {
+        m if !m.is_finite() || !is_far(m) => 1.0,
+        m if m > 1.0 => 2f64.powi(-600),
+        _ => 2f64.powi(600),
+    };
+    let [z, y, x] = g.map(|g| g * by);
+    (z * z + y * y + x * x).sqrt() / by
+}
+
 /// Scales, rounds once and stores `n` voxels from voxel `[z, y, x]` of the outputs on.
 #[inline(always)]
 fn store([z, y, x]: [usize; 3], n: usize, slope: f64, parts: &mut [f64], out: &mut GradientOut) {
@@ -396,7 +443,17 @@ fn store([z, y, x]: [usize; 3], n: usize, slope: f64, parts: &mut [f64], out: &m
     let (gz, rest) = parts.split_at(RUN);
     let (gy, gx) = rest.split_at(RUN);
     if let Some(dst) = &mut out.magnitude {
-        put(dst, [z, y, x], n, |i| (gz[i] * gz[i] + gy[i] * gy[i] + gx[i] * gx[i]).sqrt());
+        let mut far = false;
+        for g in [gz, gy, gx] {
+            for g in &g[..n] {
+                far |= is_far(*g);
+            }
+        }
+        if far {
+            put(dst, [z, y, x], n, |i| far_length([gz[i], gy[i], gx[i]]));
+        } else {
+            put(dst, [z, y, x], n, |i| (gz[i] * gz[i] + gy[i] * gy[i] + gx[i] * gx[i]).sqrt());
+        }
     }
     if let Some(vector) = &mut out.vector {
         for (dst, g) in vector.iter_mut().zip([gz, gy, gx]) {

@@ -252,3 +252,64 @@ fn an_infinity_changes_only_windows_that_hold_it() {
         assert_eq!(a[0][i].to_bits() == b[0][i].to_bits(), i + 2 < 18 || i + 2 > 22 || i + 2 == 20, "voxel {i}");
     }
 }
+
+/// The same field with and without a large offset, which every type here holds exactly.
+#[test]
+fn an_offset_of_all_values_cancels_along_every_axis() {
+    let shape = [5, 6, 11];
+    let mut noise = Noise(3);
+    let small: Vec<f64> = (0..shape.iter().product()).map(|_| noise.below(8) as f64).collect();
+    let cases = [
+        (DType::U8, 200.0),
+        (DType::I16, 32_000.0),
+        (DType::F32, 16_000_000.0),
+        (DType::U32, 4e9),
+        (DType::I32, 2_147_483_000.0),
+        (DType::F64, 1e12),
+        (DType::F64, 2f64.powi(52)),
+    ];
+    for (dtype, offset) in cases {
+        for (size, weight) in [3, 5].into_iter().flat_map(|s| WEIGHTS.map(|w| (s, w))) {
+            let of = |offset: f64| {
+                let mut v = Voxels::zeroed(dtype, small.len());
+                crate::with_voxels!(&mut v, v => v.iter_mut().zip(&small).for_each(|(v, s)| *v = Voxel::from_f64(s + offset)));
+                vector_of(&v, shape, size, weight)
+            };
+            let result = if dtype.result() == DType::F32 { 3e-7 } else { 1e-14 };
+            for (raised, plain) in of(offset).into_iter().zip(of(0.0)) {
+                // weighed sums of f32 and short integers lose 24 bits of 53 at most
+                let lost = if dtype == DType::F32 { 1e-6 } else { 1e-10 };
+                let lost = if dtype.result() == DType::F64 { 0.0 } else { lost };
+                assert!((raised - plain).abs() <= result * 8.0 + lost, "{dtype} {offset} {size}: {raised} {plain}");
+            }
+        }
+    }
+}
+
+#[test]
+fn lengths_do_not_leave_the_range_of_f64() {
+    let shape = [3, 5, 9];
+    for scale in [1e-300, 1e-170, 1e-150, 1.0, 1e145, 1e160, 1e300] {
+        let v = Voxels::F64((0..135).map(|i| f64::from(i) * scale).collect());
+        let (mut got, mut scratch) = (Voxels::zeroed(DType::F64, 5), Scratch::default());
+        let out = GradientOut { magnitude: Some(got.view_mut([1, 1, 5])), vector: None };
+        let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+        gradient(v.view(shape), 3, WEIGHTS[0], [1.0; 3], Affine::IDENTITY, None, [1, 1, 2], out, &mut cx);
+        let expect = (45f64 * 45.0 + 81.0 + 1.0).sqrt() * scale;
+        assert!((got.at(2) / expect - 1.0).abs() < 1e-14, "{scale}: {} {expect}", got.at(2));
+    }
+}
+
+/// Components z, y, x of all inner voxels.
+fn vector_of(v: &Voxels, shape: [usize; 3], size: usize, weight: GradientWeight) -> Vec<f64> {
+    let half = size / 2;
+    let inner = shape.map(|n| n - 2 * half);
+    let (n, dtype) = (inner.iter().product(), v.dtype().result());
+    let mut got = [0; 3].map(|_| Voxels::zeroed(dtype, n));
+    let vector = Some(got.each_mut().map(|g| g.view_mut(inner)));
+    let mut scratch = Scratch::default();
+    let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
+    let out = GradientOut { magnitude: None, vector };
+    gradient(v.view(shape), size, weight, [2.0, 1.0, 0.7], Affine::IDENTITY, None, [half; 3], out, &mut cx);
+    got.iter().flat_map(|g| (0..n).map(|i| g.at(i))).collect()
+}

@@ -175,7 +175,9 @@ impl Lowering<'_> {
         let lattice =
             Lattice { input, shape: info.shape, spacing: info.spacing, origin: info.origin, unit: info.unit.clone() };
         self.out.graph.lattices.push(lattice);
-        let missing = info.nodata.filter(|_| !info.dtype.is_float()).filter(|v| v.fract() == 0.0 && v.abs() < 1e15);
+        // What the type cannot hold is no voxel's value.
+        let (least, most) = info.dtype.range();
+        let missing = info.nodata.filter(|v| !info.dtype.is_float() && v.fract() == 0.0 && (least..=most).contains(v));
         let wire = Wire {
             name: node.name.clone(),
             channel: "value".into(),

@@ -55,6 +55,17 @@ fn append_le<T: Voxel>(row: &[T], out: &mut Vec<u8>) {
     }
 }
 
+/// The voxels with one NaN for all, if there is any: its sign and payload hang on the instructions that made it, and a box of
+/// nothing else is stored as the fill value.
+fn one_nan<T: Voxel>(v: View<T>) -> Option<Vec<T>> {
+    #[allow(clippy::eq_op)] // only NaN differs from itself
+    let is_nan = |v: &T| v != v;
+    let rows = || (0..v.shape[0] * v.shape[1]).map(|r| v.row_at(r / v.shape[1], r % v.shape[1]));
+    let any = T::DTYPE.is_float() && rows().any(|row| row.iter().fold(false, |any, v| any | is_nan(v)));
+    let nan = T::from_f64(f64::NAN);
+    any.then(|| rows().flatten().map(|v| if is_nan(v) { nan } else { *v }).collect())
+}
+
 impl Encoder {
     pub fn new(codec: Codec, dtype: DType, fill: f64) -> Encoder {
         Encoder {
@@ -72,6 +83,8 @@ impl Encoder {
             if self.holds_only_fill(v) {
                 return Ok(Encoded::Empty);
             }
+            let one_nan = one_nan(v);
+            let v = one_nan.as_ref().map_or(v, |voxels| View::dense(voxels, v.shape));
             let size = voxels.dtype().size();
             if self.codec != Codec::None
                 && let Some(bytes) = whole(v, chunk)

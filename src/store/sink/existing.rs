@@ -74,9 +74,10 @@ pub fn existing(path: &Path) -> Existing {
                 Existing::Ours { complete: occlude["complete"] == true, occlude: Some(occlude) }
             }
             _ => {
-                // Killed between making the folder and its metadata.
-                let empty = fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_none());
-                if empty && meta.is_some() { unfinished } else { Existing::Foreign }
+                // Killed between making the folder and its attributes, or between removing these and the folder.
+                let is_group = |e: io::Result<fs::DirEntry>| e.is_ok_and(|e| e.file_name() == ".zgroup");
+                let bare = fs::read_dir(path).is_ok_and(|mut entries| entries.all(is_group));
+                if bare && meta.is_some() { unfinished } else { Existing::Foreign }
             }
         },
         Ok(_) if is_finished_file(path) => {
@@ -153,14 +154,19 @@ pub fn remove_ours(path: &Path) -> Result<()> {
     remove_work_dir(&Sink::work_dir(path))
 }
 
-/// Takes back that a group is complete, before anything of it goes; where that cannot be written, nothing can be removed.
+/// Takes back that a group is complete, and leaves a marker in its work folder, before anything of it goes; where that cannot be
+/// written, nothing can be removed.
 fn mark_unfinished(path: &Path) -> Result<()> {
+    let work = Sink::work_dir(path);
+    if meta_of(path).is_none() {
+        files::Temps::open(&work)?.write(&[(work.join(META), br#"{"complete":false}"#.to_vec())])?;
+    }
     for (name, at) in [("zarr.json", "/attributes/occlude"), (".zattrs", "/occlude")] {
         let file = path.join(name);
         let Some(mut group) = read_json(&file) else { continue };
         let Some(occlude) = group.pointer_mut(at).and_then(Value::as_object_mut) else { continue };
         if occlude.remove("complete").is_some() {
-            let temps = files::Temps::open(&Sink::work_dir(path))?;
+            let temps = files::Temps::open(&work)?;
             temps.write(&[(file, group.to_string().into_bytes())])?;
         }
     }

@@ -64,7 +64,8 @@ fn group_files(spec: &SinkSpec, occlude: Option<&Value>, windows: &[[f64; 2]]) -
     let attributes = metadata::group_attributes(spec, occlude, windows);
     if spec.format == OutputFormat::OmeZarr04 {
         let group = b"{\n  \"zarr_format\": 2\n}\n".to_vec();
-        return vec![(spec.path.join(".zgroup"), group), (spec.path.join(".zattrs"), json_bytes(&attributes))];
+        // The attributes first: by them a folder is known as this program's.
+        return vec![(spec.path.join(".zattrs"), json_bytes(&attributes)), (spec.path.join(".zgroup"), group)];
     }
     vec![(spec.path.join("zarr.json"), json_bytes(&metadata::group_v3(attributes)))]
 }

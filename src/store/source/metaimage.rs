@@ -7,7 +7,7 @@ use super::bytes;
 use super::parts::{self, Axis, Extra};
 use super::planar::{Parsed, Pending, shape_of};
 use super::raw::refuse;
-use super::spool::{Packed, Packing};
+use super::spool::{After, Packed, Packing};
 use super::units;
 use crate::config::Input;
 use crate::grid::DType;
@@ -116,8 +116,9 @@ fn geometry(path: &Path, h: &Header, dims: usize, info: &mut VolumeInfo) -> Resu
     Ok(())
 }
 
-/// Files with the voxels, whether they are the header's own file, and how many axes each spans.
-fn data_files(path: &Path, h: &Header) -> Result<(Vec<PathBuf>, bool, Option<usize>)> {
+/// Files with the voxels, whether they are the header's own file, and how many axes each spans. A pattern without an end names so
+/// many slices.
+fn data_files(path: &Path, h: &Header, slices: u64) -> Result<(Vec<PathBuf>, bool, Option<usize>)> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let text = h.get(&["ElementDataFile"]).unwrap_or_default();
     let words: Vec<&str> = text.split_whitespace().collect();
@@ -129,7 +130,9 @@ fn data_files(path: &Path, h: &Header) -> Result<(Vec<PathBuf>, bool, Option<usi
         }
         Some(first) if first.contains('%') => {
             let number = |i: usize, or: i64| words.get(i).and_then(|w| w.parse().ok()).unwrap_or(or);
-            return Ok((parts::pattern(path, folder, first, number(1, 1), number(2, 1), number(3, 1))?, false, None));
+            let (from, step) = (number(1, 1), number(3, 1));
+            let to = number(2, from.saturating_add(i64::try_from(slices).unwrap_or(i64::MAX).saturating_sub(1)));
+            return Ok((parts::pattern(path, folder, first, from, to, step)?, false, None));
         }
         None => return Err(Error::file(path, "broken MetaImage header: ElementDataFile is empty")),
         _ => {}
@@ -172,7 +175,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     info.times = layout.times as usize;
     geometry(path, &h, dims, &mut info)?;
 
-    let (files, local, spanned) = data_files(path, &h)?;
+    let (files, local, spanned) = data_files(path, &h, sizes[dims - 1])?;
     let skip = h.numbers::<i64>(path, &["HeaderSize"], 1)?.map_or(0, |n| n[0]);
     if !(-1..1 << 48).contains(&skip) {
         return Err(broken(format!("HeaderSize {skip}; a number from -1 is expected")));
@@ -191,7 +194,8 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
         let lattice = parts::over_files(path, lattice(0)?, &axes, files.len(), spanned, skip as u64)?;
         return Ok(Parsed { info, lattice, files, pending: Pending::Nothing, header, exact: false });
     }
-    let start = if local { h.len as u64 } else { 0 };
+    // A positive HeaderSize counts from the start of the file, whichever that is.
+    let start = if local && skip <= 0 { h.len as u64 } else { 0 };
     if packed {
         let start = start + skip.max(0) as u64;
         let packed = Packed {
@@ -200,7 +204,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
             start,
             skip: 0,
             len: layout.bytes,
-            trailing_ignore: false,
+            after: After::Refused,
         };
         return Ok(Parsed {
             info,

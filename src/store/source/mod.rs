@@ -30,7 +30,7 @@ use std::path::{Path, PathBuf};
 use super::VolumeInfo;
 use crate::brick::Voxels;
 use crate::config::{Input, InputKind};
-use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, ViewMut, Voxel};
+use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, Voxel};
 use crate::kernel::simd::Level;
 use crate::{Error, Result};
 use detect::Format;
@@ -185,16 +185,16 @@ impl Source {
             )));
         }
         let bytes = match &self.kind {
-            Kind::Planar(planar) => planar.read(self.level, component, region, reborrow(&mut dst), keep)?,
+            Kind::Planar(planar) => planar.read(self.level, component, region, dst.reborrow(), keep)?,
             Kind::Zarr(array) => match &self.flat {
                 Some(Some(flat)) => {
-                    flat.planes.read(self.level, component, region, reborrow(&mut dst), keep)?;
+                    flat.planes.read(self.level, component, region, dst.reborrow(), keep)?;
                     0
                 }
-                _ => array.read(component, region, &self.info, reborrow(&mut dst))?,
+                _ => array.read(component, region, &self.info, dst.reborrow())?,
             },
             Kind::Synthetic(field) => {
-                field.read(region, reborrow(&mut dst));
+                field.read(region, dst.reborrow());
                 0
             }
         };
@@ -351,21 +351,4 @@ fn overridden(mut info: VolumeInfo, input: &Input) -> Result<VolumeInfo> {
     }
     info.nodata = input.nodata.or(info.nodata);
     Ok(info)
-}
-
-/// A shorter borrow of the same voxels.
-fn reborrow<'a>(dst: &'a mut AnyViewMut<'_>) -> AnyViewMut<'a> {
-    fn again<'a, T>(v: &'a mut ViewMut<'_, T>) -> ViewMut<'a, T> {
-        v.reborrow()
-    }
-    match dst {
-        AnyViewMut::U8(v) => AnyViewMut::U8(again(v)),
-        AnyViewMut::I8(v) => AnyViewMut::I8(again(v)),
-        AnyViewMut::U16(v) => AnyViewMut::U16(again(v)),
-        AnyViewMut::I16(v) => AnyViewMut::I16(again(v)),
-        AnyViewMut::U32(v) => AnyViewMut::U32(again(v)),
-        AnyViewMut::I32(v) => AnyViewMut::I32(again(v)),
-        AnyViewMut::F32(v) => AnyViewMut::F32(again(v)),
-        AnyViewMut::F64(v) => AnyViewMut::F64(again(v)),
-    }
 }

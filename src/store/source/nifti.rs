@@ -6,7 +6,7 @@ use super::bytes;
 use super::lattice::{Lattice, Planes};
 use super::planar::{Parsed, Pending, components, shape_of};
 use super::raw::refuse;
-use super::spool::{Packed, Packing};
+use super::spool::{After, Packed, Packing};
 use crate::config::Input;
 use crate::grid::{Affine, DType};
 use crate::store::VolumeInfo;
@@ -210,7 +210,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let start = bytes::file_head(path, MOST_HEADER)?;
     let gzip = start.starts_with(&[0x1f, 0x8b]);
     let mut packed =
-        Packed { path: path.to_path_buf(), packing: Packing::Gzip, start: 0, skip: 0, len: 0, trailing_ignore: false };
+        Packed { path: path.to_path_buf(), packing: Packing::Gzip, start: 0, skip: 0, len: 0, after: After::Allowed };
     let head = if gzip { bytes::head(path, &mut *packed.reader()?, MOST_HEADER)? } else { start };
     let h = parse(path, &head)?;
     let dtype = dtype(path, h.datatype)?;

@@ -8,7 +8,7 @@ use super::lattice::Lattice;
 use super::parts::{self, Axis, Extra};
 use super::planar::{Parsed, Pending, shape_of};
 use super::raw::refuse;
-use super::spool::{Packed, Packing};
+use super::spool::{After, Packed, Packing};
 use super::units;
 use crate::config::Input;
 use crate::grid::DType;
@@ -424,7 +424,7 @@ pub fn open(input: &Input, path: &Path) -> Result<Parsed> {
     let start = parts::skip_lines(file, if attached { h.len as u64 } else { 0 }, skip_lines as u64)?;
     if let Some(packing) = packing {
         let skip = u64::try_from(skip_bytes).map_err(|_| Error::file(path, "byte skip -1 is for encoding raw only"))?;
-        let packed = Packed { path: file.clone(), packing, start, skip, len: layout.bytes, trailing_ignore: false };
+        let packed = Packed { path: file.clone(), packing, start, skip, len: layout.bytes, after: After::Allowed };
         return Ok(Parsed {
             info,
             lattice: lattice(0)?,

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::bytes;
 use super::lattice::{Lattice, Planes};
 use super::planar::{Parsed, Pending, components, key, shape_of};
-use super::spool::{Packed, Packing};
+use super::spool::{After, Packed, Packing};
 use crate::config::{Input, RawFormat};
 use crate::grid::DType;
 use crate::store::VolumeInfo;
@@ -35,8 +35,9 @@ pub fn open_raw(input: &Input, path: &Path, raw: &RawFormat) -> Result<Parsed> {
     let packed = start == [0x1f, 0x8b] && path.extension().is_some_and(|e| e.eq_ignore_ascii_case("gz"));
     let (lattice, pending) = if packed {
         lattice(raw.offset)?;
-        let (path, trailing_ignore) = (path.to_path_buf(), raw.trailing_ignore);
-        let packed = Packed { path, packing: Packing::Gzip, start: 0, skip: raw.offset, len: all, trailing_ignore };
+        let after = if raw.trailing_ignore { After::Ignored } else { After::Refused };
+        let path = path.to_path_buf();
+        let packed = Packed { path, packing: Packing::Gzip, start: 0, skip: raw.offset, len: all, after };
         (lattice(0)?, Pending::Unpack(packed))
     } else {
         (lattice(raw.offset)?, Pending::Nothing)

@@ -30,8 +30,17 @@ pub struct Packed {
     pub skip: u64,
     /// Bytes of voxels after them.
     pub len: u64,
-    /// Unpacked bytes after the voxels are allowed.
-    pub trailing_ignore: bool,
+    pub after: After,
+}
+
+/// What becomes of unpacked bytes after the voxels. The stream's checksum is verified but with `Ignored`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum After {
+    Refused,
+    /// Allowed, as other readers of the format do.
+    Allowed,
+    /// Not even looked at, nor what may follow the stream.
+    Ignored,
 }
 
 /// Told the bytes done; `false` stops.
@@ -90,10 +99,10 @@ impl Packed {
         if done < self.len {
             return Err(self.wrong_len((self.skip + done).to_string()));
         }
-        if !self.trailing_ignore {
+        if self.after != After::Ignored {
             // Read to the end: this also verifies the stream's checksum. A few blocks more are counted, a bomb is not.
             let more = self.copy(&mut *reader, None, 64 * BLOCK as u64, &mut block, &|_| true)?;
-            if more > 0 {
+            if more > 0 && self.after == After::Refused {
                 let total = self.skip + done + more;
                 let most = more == 64 * BLOCK as u64;
                 return Err(self.wrong_len(format!("{}{total}", if most { "at least " } else { "" })));

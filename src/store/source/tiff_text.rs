@@ -208,13 +208,19 @@ fn listed(path: &Path, body: &str, order: &Order) -> Result<Option<Vec<Option<us
         }
     }
     let mut list = vec![None; total];
+    let mut left = total.saturating_mul(2);
     for (b, _) in tags(body, "TiffData") {
         let number = |name: &str| attribute(b, name).and_then(|v| v.parse::<usize>().ok());
         let first =
             plain.index(number("FirstZ").unwrap_or(0), number("FirstC").unwrap_or(0), number("FirstT").unwrap_or(0));
         let planes = number("PlaneCount").unwrap_or(if number("IFD").is_some() { 1 } else { total });
         let (first, ifd) = (first.unwrap_or(total), number("IFD").unwrap_or(0));
-        for k in 0..planes.min(total.saturating_sub(first)) {
+        let planes = planes.min(total.saturating_sub(first));
+        let Some(rest) = left.checked_sub(planes) else {
+            return Err(Error::file(path, format!("the OME description places more than {total} planes twice")));
+        };
+        left = rest;
+        for k in 0..planes {
             list[slots[first + k]] = ifd.checked_add(k);
         }
     }

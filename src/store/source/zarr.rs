@@ -468,7 +468,7 @@ impl ZarrArray {
                 ChunkRead::Data { stored_bytes } => read += stored_bytes,
             }
             let cell = Region::of_cell(index, [0; 3], chunk_shape);
-            crate::brick::gather::copy_common(chunk.view(chunk_shape), cell, super::reborrow(&mut dst), region);
+            crate::brick::gather::copy_common(chunk.view(chunk_shape), cell, dst.reborrow(), region);
         }
         Ok(read)
     }

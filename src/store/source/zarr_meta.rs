@@ -77,9 +77,37 @@ pub fn json(path: &Path) -> Result<Option<(Value, Vec<u8>)>> {
     if text.len() > MOST_METADATA {
         return Err(Error::file(path, format!("metadata of more than {MOST_METADATA} bytes are not read")));
     }
-    // Python writes NaN bare in attributes, which JSON does not know.
-    let value = serde_json::from_slice(&text).map_err(|e| Error::file(path, format!("broken JSON: {e}")))?;
+    let value = serde_json::from_slice(&text).or_else(|e| match without_bare_numbers(&text) {
+        Some(text) => serde_json::from_slice(&text),
+        None => Err(e),
+    });
+    let value = value.map_err(|e| Error::file(path, format!("broken JSON: {e}")))?;
     Ok(Some((value, text)))
+}
+
+/// Python writes NaN and infinities bare in attributes, which JSON does not know: `null` in their place. `None` where there are none.
+fn without_bare_numbers(text: &[u8]) -> Option<Vec<u8>> {
+    let mut out = Vec::with_capacity(text.len());
+    let (mut quoted, mut i, mut found) = (false, 0, false);
+    while i < text.len() {
+        let bare = [&b"-Infinity"[..], b"Infinity", b"NaN"].into_iter().find(|w| !quoted && text[i..].starts_with(w));
+        if let Some(word) = bare {
+            out.extend_from_slice(b"null");
+            (i, found) = (i + word.len(), true);
+            continue;
+        }
+        out.push(text[i]);
+        match text[i] {
+            b'\\' if quoted && i + 1 < text.len() => {
+                i += 1;
+                out.push(text[i]);
+            }
+            b'"' => quoted = !quoted,
+            _ => {}
+        }
+        i += 1;
+    }
+    found.then_some(out)
 }
 
 fn sizes(path: &Path, what: &str, value: &Value, axes: Option<usize>, least: u64) -> Result<Vec<u64>> {

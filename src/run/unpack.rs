@@ -1,0 +1,53 @@
+//! Unpacks gzip and re-blocks compressed planes, once, into scratch, before a run reads or deletes anything.
+
+use std::path::PathBuf;
+
+use super::metrics::Metrics;
+use super::options::{Progress, RunOptions};
+use crate::config::Config;
+use crate::store::{Source, said_of};
+use crate::{Error, Result};
+
+/// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
+const QUIET: u64 = 64 << 20;
+
+/// The folder of files in scratch, which have no names: it goes as soon as they are made, whatever happens.
+struct Folder(PathBuf);
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Makes every source ready to be read.
+///
+/// # Errors
+/// A file is broken, scratch has no room, or somebody asked to stop.
+pub fn unpack(
+    sources: &mut [Source],
+    config: &Config,
+    options: &RunOptions,
+    progress: &dyn Progress,
+    metrics: &Metrics,
+) -> Result<()> {
+    let total: u64 = sources.iter().map(Source::spool_bytes).sum();
+    let beside = config.outputs[0].path.parent().map_or_else(|| PathBuf::from("."), PathBuf::from);
+    let base = config.run.scratch.clone().unwrap_or(beside);
+    let folder = Folder(base.join(format!(".occlude-scratch-{}", std::process::id())));
+    if total > 0 {
+        let failed = |e| Error::file(&folder.0, format!("cannot create scratch: {e}"));
+        std::fs::create_dir_all(&folder.0).map_err(failed)?;
+    }
+    for (source, input) in sources.iter_mut().zip(&config.inputs) {
+        let prepared = source.prepare(&folder.0, &|bytes| {
+            if total > QUIET {
+                progress.update(bytes, total, 0, 0, "unpack");
+            }
+            !options.cancel.is_cancelled()
+        });
+        prepared.map_err(|e| said_of(config, &input.name, e))?;
+        metrics.bytes_read(source.unpacked_bytes());
+    }
+    options.cancel.check()
+}
