@@ -1,4 +1,4 @@
-//! How users are addressed: errors, panics, logs, signals. Everything here goes to stderr.
+//! How users are addressed: errors, panics, logs, interrupts. All but results goes to stderr.
 
 use std::io::Write;
 use std::sync::OnceLock;
@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use tracing_subscriber::EnvFilter;
 
+use super::process;
 use crate::Error;
 use crate::run::Cancel;
 
@@ -79,46 +80,13 @@ pub fn interrupts() -> Cancel {
                 let text = "stopping after the bricks in hand; interrupt again to stop at once";
                 let _ = writeln!(std::io::stderr(), "{text}");
             };
-            let ignored = ignored_signals();
+            let ignored = process::ignored_signals();
             // Without a handler Ctrl-C still ends the process, only less gently.
             let _ = ctrlc::set_handler(handler);
-            ignored.into_iter().for_each(ignore_signal);
+            ignored.into_iter().for_each(process::ignore_signal);
             token
         })
         .clone()
-}
-
-/// Signals that would stop a run and that whoever started it had ignored (`nohup`, a shell's background job): they stay so.
-fn ignored_signals() -> Vec<i32> {
-    #[cfg(unix)]
-    {
-        let is_ignored = |signal: &i32| {
-            // SAFETY: zeroes are a valid `sigaction`, and with no new action the call only fills it in.
-            unsafe {
-                let mut now: libc::sigaction = std::mem::zeroed();
-                libc::sigaction(*signal, std::ptr::null(), &mut now) == 0 && now.sa_sigaction == libc::SIG_IGN
-            }
-        };
-        [libc::SIGINT, libc::SIGTERM, libc::SIGHUP].into_iter().filter(is_ignored).collect()
-    }
-    #[cfg(not(unix))]
-    Vec::new()
-}
-
-fn ignore_signal(signal: i32) {
-    #[cfg(unix)]
-    // SAFETY: a valid disposition of a signal that exists.
-    unsafe {
-        libc::signal(signal, libc::SIG_IGN);
-    }
-    let _ = signal;
-}
-
-/// A limit of file sizes (`ulimit -f`) is an error of the write that exceeds it, not the end of the process. That readers of stdout
-/// or stderr go away is an error, too (Rust ignores SIGPIPE), so that a run goes on.
-pub fn set_signals() {
-    #[cfg(unix)]
-    ignore_signal(libc::SIGXFSZ);
 }
 
 /// Writes a result to stdout. That its reader has seen enough (`occlude plan | head`) is no error.

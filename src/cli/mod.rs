@@ -13,6 +13,7 @@ pub mod messages;
 pub mod moments;
 pub mod pareto;
 pub mod plot;
+pub mod process;
 pub mod progress;
 pub mod reader;
 
@@ -29,7 +30,7 @@ use args::{Cli, Command, ConfigArgs, DeviceArg};
 /// The program: parses the command line, runs the command, returns the exit code (0 done, 1 failed, 2 wrong usage or
 /// config, 130 interrupted).
 pub fn main() -> ExitCode {
-    messages::set_signals();
+    process::set_up();
     messages::hook_panics(std::env::args_os().any(|a| a == "-v" || a == "--verbose"));
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,

@@ -93,7 +93,8 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
             && !masks.iter().any(|(m, _)| *m == s)
         {
             let value = values[mask.wire].as_mut().expect("a mask's wire is made before its reader");
-            masks.push((s, engine.mask(mask, value, region, volume, scratch)));
+            let known = program.same_mask(plan, s, brick, &masks);
+            masks.push((s, known.unwrap_or_else(|| engine.mask(mask, value, region, volume, scratch))));
         }
         let known = masks.iter().find(|(m, _)| *m == s).map_or(&MaskValue::All, |(_, m)| m);
         let since = Since::now();

@@ -1,5 +1,6 @@
 //! What is evaluated for each brick: steps in order, wires to deliver, and when a buffer is free again.
 
+use super::steps::MaskValue;
 use crate::grid::{Region, Shape};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
@@ -63,6 +64,18 @@ impl Program {
     /// The box of a step's outputs for a brick.
     pub fn step_box(&self, plan: &Plan, step: StepId, brick: Region) -> Region {
         wire_box(brick, plan.graph.steps[step].halo, self.volume)
+    }
+
+    /// The mask of a step over its box for a brick, where one of these steps has the same.
+    pub fn same_mask(
+        &self,
+        plan: &Plan,
+        step: StepId,
+        brick: Region,
+        known: &[(StepId, MaskValue)],
+    ) -> Option<MaskValue> {
+        let of = |s: StepId| (&plan.graph.steps[s].mask, self.step_box(plan, s, brick));
+        known.iter().find(|(s, _)| of(*s) == of(step)).map(|(_, mask)| mask.clone())
     }
 
     /// Wires that must be made or read, given the steps that a mask switched off. Inputs that only masks look at are not

@@ -69,10 +69,16 @@ impl Reader<'_> {
             let Some(mask) = &plan.graph.steps[s].mask else { continue };
             let Producer::Input(input) = plan.graph.wires[mask.wire].producer else { continue };
             let region = self.program.step_box(plan, s, brick);
-            let wanted = region.grow(mask.reach).clip(&volume);
-            let (mut value, _) = self.input(input, mask.wire, wanted, place, Why::Mask)?;
-            let known = self.engine.mask(mask, &mut value, region, volume, scratch);
-            value.recycle(self.engine.pool);
+            let known = match self.program.same_mask(plan, s, brick, &loaded.masks) {
+                Some(known) => known,
+                None => {
+                    let wanted = region.grow(mask.reach).clip(&volume);
+                    let (mut value, _) = self.input(input, mask.wire, wanted, place, Why::Mask)?;
+                    let known = self.engine.mask(mask, &mut value, region, volume, scratch);
+                    value.recycle(self.engine.pool);
+                    known
+                }
+            };
             if matches!(known, MaskValue::None) && self.engine.skip {
                 off.push(s);
             }

@@ -38,7 +38,7 @@ pub struct Engine<'a> {
 pub type Fetch<'a> = dyn Fn(WireId, Region, AnyViewMut) -> Result<()> + 'a;
 
 /// A mask over a step's output box: 1 = needed.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub enum MaskValue {
     All,
     None,

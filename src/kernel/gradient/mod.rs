@@ -233,7 +233,7 @@ fn planes_inner<const H: usize, T: Voxel, S: Sum<T>>(
                     weigh::<H, T, S>(&rows, missing, job.table, m, sums);
                 }
                 join_columns::<H>(sums, parts);
-                if matches!(T::DTYPE, DType::U32 | DType::I32 | DType::F64) {
+                if goes_across(T::DTYPE) {
                     across::<H, T>(&rows, missing, job.table, n, &mut parts[2 * RUN..]);
                 }
                 if gaps && any_nan(&rows[H][H][H..H + n], missing, n, parts) {
@@ -297,17 +297,19 @@ fn weigh_columns<const H: usize, T: Voxel, S: Sum<T>, const FULL: bool>(
     };
     let [in_z, in_y, in_x] = &table.along;
     let c = row(H, H);
-    for dx in 1..=H {
+    // Component x takes none of its weights where it comes from differences.
+    let own = if goes_across(T::DTYPE) { 0 } else { H };
+    for dx in 1..=own {
         add(dx - 1, in_x[0][0][dx], &c);
     }
     for d in 1..=H {
         let (a, b) = (row(H, H + d), row(H, H - d));
         let (even, odd) = (plus(&a, &b), minus(&a, &b));
-        (1..=H).for_each(|dx| add(dx - 1, in_x[0][d][dx], &even));
+        (1..=own).for_each(|dx| add(dx - 1, in_x[0][d][dx], &even));
         (0..=H).for_each(|dx| add(2 + dx, in_y[0][d][dx], &odd));
         let (a, b) = (row(H + d, H), row(H - d, H));
         let (even, odd) = (plus(&a, &b), minus(&a, &b));
-        (1..=H).for_each(|dx| add(dx - 1, in_x[d][0][dx], &even));
+        (1..=own).for_each(|dx| add(dx - 1, in_x[d][0][dx], &even));
         (0..=H).for_each(|dx| add(5 + dx, in_z[d][0][dx], &odd));
     }
     for dz in 1..=H {
@@ -316,7 +318,7 @@ fn weigh_columns<const H: usize, T: Voxel, S: Sum<T>, const FULL: bool>(
             let even = plus(&plus(&pp, &pm), &plus(&mp, &mm));
             let odd_y = plus(&minus(&pp, &pm), &minus(&mp, &mm));
             let odd_z = plus(&minus(&pp, &mp), &minus(&pm, &mm));
-            (1..=H).for_each(|dx| add(dx - 1, in_x[dz][dy][dx], &even));
+            (1..=own).for_each(|dx| add(dx - 1, in_x[dz][dy][dx], &even));
             (0..=H).for_each(|dx| add(2 + dx, in_y[dz][dy][dx], &odd_y));
             (0..=H).for_each(|dx| add(5 + dx, in_z[dz][dy][dx], &odd_z));
         }
@@ -336,9 +338,13 @@ fn minus<T, S: Sum<T>>(a: &[S; LANES], b: &[S; LANES]) -> [S; LANES] {
     std::array::from_fn(|l| a[l].minus(b[l]))
 }
 
+/// Whether component x of voxels of this type comes from [`across`].
+const fn goes_across(dtype: DType) -> bool {
+    matches!(dtype, DType::U32 | DType::I32 | DType::F64)
+}
+
 /// Component x of `n` voxels from differences of mirrored voxels.
 #[inline(always)]
-#[allow(clippy::needless_range_loop)] // offsets index weights and rows alike
 fn across<const H: usize, T: Voxel>(
     rows: &[[&[T]; 5]; 5],
     missing: Option<T>,
@@ -346,19 +352,40 @@ fn across<const H: usize, T: Voxel>(
     n: usize,
     gx: &mut [f64],
 ) {
-    let gx = &mut gx[..n];
-    gx.fill(0.0);
+    let full = n / LANES * LANES;
+    for i in (0..full).step_by(LANES) {
+        let lanes: &mut [f64; LANES] = (&mut gx[i..i + LANES]).try_into().unwrap();
+        across_columns::<H, LANES, T>(rows, missing, table, i, lanes);
+    }
+    for (i, g) in gx[..n].iter_mut().enumerate().skip(full) {
+        across_columns::<H, 1, T>(rows, missing, table, i, std::array::from_mut(g));
+    }
+}
+
+/// The same of `L` voxels from `i` on.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // offsets index weights and rows alike
+fn across_columns<const H: usize, const L: usize, T: Voxel>(
+    rows: &[[&[T]; 5]; 5],
+    missing: Option<T>,
+    table: &Table,
+    i: usize,
+    gx: &mut [f64; L],
+) {
+    let mut sums = [0.0; L];
     for dz in 0..=2 * H {
         for dy in 0..=2 * H {
             for dx in 1..=H {
                 let w = table.along[2][dz.abs_diff(H)][dy.abs_diff(H)][dx];
-                let (before, behind) = (&rows[dz][dy][H - dx..][..n], &rows[dz][dy][H + dx..][..n]);
-                for i in 0..n {
-                    gx[i] += w * (<f64 as Sum<T>>::of(behind[i], missing) - <f64 as Sum<T>>::of(before[i], missing));
+                let before: &[T; L] = rows[dz][dy][i + H - dx..][..L].try_into().unwrap();
+                let behind: &[T; L] = rows[dz][dy][i + H + dx..][..L].try_into().unwrap();
+                for l in 0..L {
+                    sums[l] += w * (<f64 as Sum<T>>::of(behind[l], missing) - <f64 as Sum<T>>::of(before[l], missing));
                 }
             }
         }
     }
+    *gx = sums;
 }
 
 /// The three components (z, y, x in turn, [`RUN`] apart) from the weighted columns; past the run's end they are rubbish.
@@ -408,7 +435,7 @@ fn any_nan<T: Voxel>(centres: &[T], missing: Option<T>, n: usize, parts: &[f64])
 /// Whether a component's square may overflow or lose digits.
 #[inline(always)]
 fn is_far(g: f64) -> bool {
-    g.abs() > 1e150 || (g.abs() < 1e-140 && g != 0.0)
+    (g.abs() > 1e150) | ((g.abs() < 1e-140) & (g != 0.0))
 }
 
 /// Length of a vector whose squares may be no f64: scaled by a power of two, so that others keep their bits.

@@ -18,8 +18,7 @@ use crate::grid::Region;
 use crate::store::os::FileExt;
 use crate::{Error, Result};
 
-/// File handles kept open at once: more shards than that are reopened as needed, so that limits of the system (often
-/// 1024 per process) are far away.
+/// File handles that an output keeps open at once: more shards than that are reopened as needed.
 const OPEN_FILES: usize = 64;
 
 /// Files that are synced together when many are committed.
