@@ -3,7 +3,6 @@
 use super::args::RunArgs;
 use super::progress::Shown;
 use super::{can_write, human, load, messages, refuse_overwriting, usage, write_whole};
-use crate::config::InputKind;
 use crate::config::check::{resolved, work_folder};
 use crate::run::{self, Report, RunOptions};
 use crate::{Error, Result};
@@ -18,10 +17,7 @@ pub fn run(args: &RunArgs, quiet: bool) -> Result<()> {
         if folder.is_some_and(|f| !f.is_dir()) || path.is_dir() {
             return Err(usage(flag, format!("got {}; expected a file in an existing folder", path.display())));
         }
-        let inputs = config.inputs.iter().filter_map(|i| match &i.kind {
-            InputKind::Path { path, .. } => Some(path.as_path()),
-            InputKind::Synthetic { .. } => None,
-        });
+        let inputs = config.inputs.iter().filter_map(|i| i.kind.path());
         refuse_overwriting(flag, path, inputs.chain([config.file.as_path()]))?;
         let real = resolved(path);
         let writes = |p: &std::path::Path| real.starts_with(resolved(p)) || real.starts_with(resolved(&work_folder(p)));

@@ -108,14 +108,11 @@ impl Volume {
 
     /// An input of a config, with its overrides; what has to be unpacked goes to `folder`.
     pub fn of_input(given: &Input, folder: &Path, cancel: &Cancel) -> Result<Volume> {
-        let path = match &given.kind {
-            InputKind::Path { path, .. } => path.clone(),
-            InputKind::Synthetic { .. } => PathBuf::from(&given.name),
-        };
+        let path = given.kind.path().unwrap_or(Path::new(&given.name));
         let mut source = Source::open(given)?;
         source.prepare(folder, &|_| !cancel.is_cancelled())?;
         cancel.check()?;
-        Ok(Volume::new(&path, source, Attributes::default(), None))
+        Ok(Volume::new(path, source, Attributes::default(), None))
     }
 
     fn open_level(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {

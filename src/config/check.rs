@@ -3,7 +3,7 @@
 use std::path::{Component, Path, PathBuf};
 
 use super::section::error;
-use super::{Config, InputKind, Op, Output, OutputDType, OutputRange, Place, Ref, StageNode, op_channels};
+use super::{Config, Op, Output, OutputDType, OutputRange, Place, Ref, StageNode, op_channels};
 use crate::stage::{Method, Reduce};
 use crate::{Error, Result};
 
@@ -162,14 +162,8 @@ fn check_output(config: &Config, output: &Output) -> Result<()> {
 }
 
 fn paths(config: &Config) -> Result<()> {
-    let inputs: Vec<(&str, PathBuf)> = config
-        .inputs
-        .iter()
-        .filter_map(|i| match &i.kind {
-            InputKind::Path { path, .. } => Some((i.name.as_str(), resolved(path))),
-            InputKind::Synthetic { .. } => None,
-        })
-        .collect();
+    let inputs: Vec<(&str, PathBuf)> =
+        config.inputs.iter().filter_map(|i| Some((i.name.as_str(), resolved(i.kind.path()?)))).collect();
     let outputs: Vec<PathBuf> = config.outputs.iter().map(|o| resolved(&o.path)).collect();
     for (i, output) in config.outputs.iter().enumerate() {
         let path = &outputs[i];

@@ -1,6 +1,6 @@
 //! The typed configuration, as the user meant it: names checked, units still as given (the planner knows the spacing).
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::grid::{Border, DType};
 use crate::stage::{
@@ -105,6 +105,16 @@ pub enum InputKind {
     Path { path: PathBuf, raw: Option<RawFormat> },
     /// A synthetic field by name (`synthetic = "sphere"`), its shape, dtype and seed.
     Synthetic { field: String, shape: [usize; 3], dtype: DType, seed: u64 },
+}
+
+impl InputKind {
+    /// The file or folder; a synthetic field has none.
+    pub fn path(&self) -> Option<&Path> {
+        match self {
+            InputKind::Path { path, .. } => Some(path),
+            InputKind::Synthetic { .. } => None,
+        }
+    }
 }
 
 /// Headerless voxels, x fastest.

@@ -131,21 +131,26 @@ fn cells_chunk(
     region: Region,
 ) -> Result<u64> {
     let [_, ny, nx] = region.shape();
-    let planes = (AT_ONCE / (8 * ny * nx)).max(1) as i64;
+    let planes = (AT_ONCE / (8 * ny * nx)).max(1);
     let mut bytes = 0;
     for component in 0..components(output) {
         let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
-        let slab_bytes = planes as usize * ny * nx * output.spec.dtype.size();
+        let slab_bytes = planes * ny * nx * output.spec.dtype.size();
         let slabs = rounded.as_bytes_mut().par_chunks_mut(slab_bytes).enumerate();
         slabs.for_each_init(Room::default, |room, (i, dst)| {
-            let lo = region.lo[0] + i as i64 * planes;
-            let hi = (lo + planes).min(region.hi[0]);
-            let slab = Region::new([lo, region.lo[1], region.lo[2]], [hi, region.hi[1], region.hi[2]]);
+            let slab = slab(region, planes, i);
             dst.copy_from_slice(cells_slab(output, target, [fine, next], k, component, slab, room).as_bytes());
         });
         bytes += store(output, target, k, component, region, &rounded)?;
     }
     Ok(bytes)
+}
+
+/// The `i`th slab of so many planes of a region.
+fn slab(region: Region, planes: usize, i: usize) -> Region {
+    let lo = region.lo[0] + (i * planes) as i64;
+    let hi = (lo + planes as i64).min(region.hi[0]);
+    Region::new([lo, region.lo[1], region.lo[2]], [hi, region.hi[1], region.hi[2]])
 }
 
 /// What a thread needs for slabs of cells.
@@ -209,26 +214,22 @@ fn map_chunk(
     let (layout, below) = (&map.chain.levels[k], &map.chain.levels[k - 1]);
     let [_, ny, nx] = region.shape();
     // Two planes above and below are seen by each slab.
-    let planes = (MAP_CELLS / (ny * nx)).max(4) as i64;
+    let planes = (MAP_CELLS / (ny * nx)).max(4);
     let mut scratch = Scratch::new();
     let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
     let mut made = Moments::default();
-    let size = output.spec.dtype.size();
     let mut rounded: Vec<Voxels> =
         map.moments.iter().map(|_| Voxels::zeroed(output.spec.dtype, region.voxels())).collect();
-    for lo in (region.lo[0]..region.hi[0]).step_by(planes as usize) {
-        let hi = (lo + planes).min(region.hi[0]);
-        let slab = Region::new([lo, region.lo[1], region.lo[2]], [hi, region.hi[1], region.hi[2]]);
+    for i in 0..region.shape()[0].div_ceil(planes) {
+        let slab = slab(region, planes, i);
         let from = needed(slab, layout.halved, below.shape);
         let source = Moments { mean: read_plane(fine, 0, from), variance: read_plane(fine, 1, from) };
         coarsen(&source, from, below.shape, layout.halved, slab, &mut made, &mut cx);
-        let start = (lo - region.lo[0]) as usize * ny * nx;
         for ((component, &which), rounded) in map.moments.iter().enumerate().zip(&mut rounded) {
             let values = if which == 0 { &made.mean } else { &made.variance };
-            let mut part = Voxels::zeroed(output.spec.dtype, slab.voxels());
             let view = AnyView::F64(View::dense(values, slab.shape()));
-            convert_at(Level::detect(), view, output.mapping(component, target.range), part.view_mut(slab.shape()));
-            rounded.as_bytes_mut()[start * size..][..slab.voxels() * size].copy_from_slice(part.as_bytes());
+            let part = rounded.view_mut(region.shape()).part(region.offset_of(&slab), slab.shape());
+            convert_at(Level::detect(), view, output.mapping(component, target.range), part);
         }
         for (plane, values) in [&made.mean, &made.variance].into_iter().enumerate() {
             next.write(plane, slab, as_bytes(values));

@@ -143,6 +143,7 @@ impl<'a> Session<'a> {
             last_tick: AtomicU64::new(0),
         };
         session.prepare(start, header)?;
+        session.plan.groups.iter().for_each(|g| session.count_resumed(g));
         Ok(session)
     }
 
@@ -150,7 +151,6 @@ impl<'a> Session<'a> {
         let resume = match start {
             Start::Complete => {
                 self.done.iter_mut().for_each(|d| *d = true.into());
-                self.plan.groups.iter().for_each(|g| self.count_resumed(g));
                 journal::remove(&outputs::journal_dir(&self.plan));
                 return self.plan.outputs.iter().try_for_each(|o| o.spec.forget_work());
             }
@@ -192,7 +192,6 @@ impl<'a> Session<'a> {
             }
         }
         self.journal = Some(Journal::open(&outputs::journal_dir(&self.plan), &header, resume)?);
-        self.plan.groups.iter().for_each(|g| self.count_resumed(g));
         Ok(())
     }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::Source;
 use crate::config::check::resolved;
-use crate::config::{Config, Input, InputKind};
+use crate::config::{Config, Input};
 use crate::{Error, Result};
 
 /// Opens the config's inputs in order, for a run within its budget: headers only. Errors name the line of the key.
@@ -33,7 +33,7 @@ pub fn open_inputs(config: &Config) -> Result<Vec<Source>> {
 /// anything is opened, and slices of a folder may be many.
 pub fn named_files(config: &Config, sources: &[Source]) -> Vec<PathBuf> {
     let beside = |(input, source): (&Input, &Source)| {
-        let InputKind::Path { path, .. } = &input.kind else { return Vec::new() };
+        let Some(path) = input.kind.path() else { return Vec::new() };
         source.paths().into_iter().filter(|file| !file.starts_with(path)).map(|file| resolved(&file)).collect()
     };
     config.inputs.iter().zip(sources).flat_map(beside).collect()

@@ -26,6 +26,12 @@ fn reserve(file: &File, path: &Path, bytes: u64) -> std::io::Result<()> {
     })
 }
 
+/// Bytes of an array's file, which is never empty.
+fn file_bytes(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<u64> {
+    let bytes = shape.iter().try_fold(planes * item, |n, &s| n.checked_mul(s));
+    bytes.map(|n| n.max(1) as u64).ok_or_else(|| Error::file(path, "the scratch array is too large"))
+}
+
 /// `planes` dense arrays of one shape and item size, one after the other, in a file.
 #[derive(Debug)]
 pub struct Spill {
@@ -43,7 +49,7 @@ impl Spill {
     /// # Errors
     /// It is not there, or of another size.
     pub fn reopen(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<Spill> {
-        let wanted = shape.iter().fold((planes * item) as u64, |n, &s| n.saturating_mul(s as u64)).max(1);
+        let wanted = file_bytes(path, shape, planes, item)?;
         match std::fs::metadata(path) {
             Ok(m) if m.is_file() && m.len() == wanted => Spill::open(path, shape, planes, item),
             _ => {
@@ -56,8 +62,7 @@ impl Spill {
     /// Opens or creates the array. An existing file of the right size keeps its contents.
     pub fn open(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<Spill> {
         let fail = |what: &str, e: std::io::Error| Error::file(path, format!("cannot {what} scratch: {e}"));
-        let bytes = shape.iter().try_fold(planes * item, |n, &s| n.checked_mul(s));
-        let bytes = bytes.ok_or_else(|| Error::file(path, "the scratch array is too large"))?;
+        let bytes = file_bytes(path, shape, planes, item)?;
         if let Some(dir) = path.parent() {
             std::fs::create_dir_all(dir).map_err(|e| fail("create the folder of", e))?;
         }
@@ -68,7 +73,7 @@ impl Spill {
             .truncate(false)
             .open(path)
             .map_err(|e| fail("open", e))?;
-        reserve(&file, path, bytes.max(1) as u64).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
+        reserve(&file, path, bytes).map_err(|e| fail(&format!("reserve {bytes} bytes of"), e))?;
         let map = MmapRaw::map_raw(&file).map_err(|e| fail("map", e))?;
         Ok(Spill { path: path.to_path_buf(), file, map, shape, planes, item })
     }

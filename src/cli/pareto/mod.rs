@@ -85,16 +85,20 @@ fn accepted(args: &ParetoArgs, job: &Pareto, say: &dyn Fn(&str)) -> Result<Vec<(
         let path = job.folder.join(format!("run{i}.zarr"));
         match variant(args, job, &settings, &path) {
             Ok(config) => accepted.push((settings, config, path)),
-            Err(e) => {
-                say(&format!("left out: {}: {e}", label(&settings)));
-                refused.push(format!("{}: {e}", label(&settings)));
-            }
+            Err(e) => refused.push(left_out(&settings, &e, say)),
         }
     }
     match accepted.is_empty() {
         true => Err(none_left(job, args, &refused)),
         false => Ok(accepted),
     }
+}
+
+/// Tells that a combination is left out; which and why.
+fn left_out(settings: &Table, error: &Error, say: &dyn Fn(&str)) -> String {
+    let what = format!("{}: {error}", label(settings));
+    say(&format!("left out: {what}"));
+    what
 }
 
 /// Says why the first one was refused.
@@ -120,8 +124,7 @@ fn all_rows(
             Ok(cost) => cost,
             // The planner refuses, or there is no such device.
             Err(e @ (Error::Config { .. } | Error::NoDevice(_))) => {
-                say(&format!("left out: {}: {e}", label(&settings)));
-                refused.push(format!("{}: {e}", label(&settings)));
+                refused.push(left_out(&settings, &e, say));
                 continue;
             }
             Err(e) => return Err(e),

@@ -4,11 +4,11 @@ use std::fs::{self, File};
 use std::path::PathBuf;
 
 use crate::config::check::resolved;
-use crate::config::{Config, InputKind, Pareto};
+use crate::config::{Config, Pareto};
 use crate::{Error, Result};
 
 /// Its name, in the folder of the results.
-pub const NAME: &str = "volumes";
+const NAME: &str = "volumes";
 /// By this file a folder is known as an earlier command's.
 const MARK: &str = ".occlude-pareto";
 
@@ -30,11 +30,8 @@ impl Work {
         let refused = |why: &str| {
             job.place.error("folder", format!("{} {why}", path.display())).located(&config.file, job.place.line)
         };
-        let read = |input: &crate::config::Input| match &input.kind {
-            InputKind::Path { path: input, .. } => resolved(input).starts_with(resolved(&path)),
-            InputKind::Synthetic { .. } => false,
-        };
-        if config.inputs.iter().any(read) {
+        let real = resolved(&path);
+        if config.inputs.iter().filter_map(|i| i.kind.path()).any(|input| resolved(input).starts_with(&real)) {
             return Err(refused("holds an input of the config, and what it holds is replaced; give another folder"));
         }
         let mark = path.join(MARK);

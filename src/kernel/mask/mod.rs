@@ -2,6 +2,8 @@
 
 mod band;
 mod boxes;
+mod distances;
+mod lines;
 
 pub use band::{Band, iso_band, scratch_bytes};
 pub use boxes::{Cost, Part, Sight, boxes};

@@ -313,10 +313,7 @@ fn overridden(mut info: VolumeInfo, input: &Input) -> Result<VolumeInfo> {
         info.spacing = spacing;
     }
     if !info.spacing.iter().all(sane) {
-        let place = match &input.kind {
-            InputKind::Path { path, .. } => path.clone(),
-            InputKind::Synthetic { .. } => PathBuf::new(),
-        };
+        let place = input.kind.path().unwrap_or(Path::new(""));
         let text = format!(
             "the spacing in the header (z, y, x) is {:?}, which is not positive; give the input spacing = [z, y, x]",
             info.spacing
