@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Condvar, Mutex, OnceLock};
 
 use super::backend;
-use super::facts::{GpuFacts, GpuKind, SLOTS};
+use super::facts::{GpuFacts, GpuKind};
 use super::shaders::{MOST_BINDINGS, Shader};
 use super::slot::Slot;
 
@@ -73,8 +73,8 @@ fn adapter(kind: GpuKind) -> Result<wgpu::Adapter, String> {
     })
 }
 
-/// Opens a device of this kind; `timed` asks for time stamps, which it may not have.
-pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
+/// Opens a device of this kind with so many slots; `timed` asks for time stamps, which it may not have.
+pub fn open(kind: GpuKind, timed: bool, slots: u64) -> Result<(Device, GpuFacts), String> {
     let adapter = adapter(kind)?;
     let stamps = wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::TIMESTAMP_QUERY_INSIDE_ENCODERS;
     let timed = timed && adapter.features().contains(stamps);
@@ -114,7 +114,7 @@ pub fn open(kind: GpuKind, timed: bool) -> Result<(Device, GpuFacts), String> {
     };
     let tick = timed.then(|| queue.get_timestamp_period() as f64);
     let kernels = Mutex::new(HashMap::new());
-    let slots = (0..SLOTS).map(|_| Slot::default()).collect();
+    let slots = (0..slots).map(|_| Slot::default()).collect();
     let (slots, idle) = (Mutex::new(slots), Condvar::new());
     Ok((Device { device, queue, kernels, tick, slots, idle, fault }, facts))
 }
@@ -183,6 +183,12 @@ impl Device {
     /// Whether a call would have to wait for a slot.
     pub fn is_busy(&self) -> bool {
         self.slots.lock().unwrap_or_else(|e| e.into_inner()).is_empty()
+    }
+
+    /// So many slots from now on. Nobody may hold one.
+    pub fn set_slots(&self, count: u64) {
+        let mut slots = self.slots.lock().unwrap_or_else(|e| e.into_inner());
+        slots.resize_with(count as usize, Slot::default);
     }
 
     /// Waits for a free slot.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::backend;
 use super::device::{self, Device, Kind, SlotGuard};
-use super::facts::{GpuFacts, GpuKind};
+use super::facts::{GpuFacts, GpuKind, SLOTS};
 use super::record::{Command, Dispatch, Recording, STAMP_BYTES, STAMPS, groups};
 
 /// Longest wait for one part. Parts take milliseconds on a GPU and seconds in software on a busy machine; a driver that
@@ -83,6 +83,8 @@ pub struct Gpu {
     timed: bool,
     /// Most bytes of one buffer; larger calls are cut.
     cap: u64,
+    /// Bricks on their way at once.
+    slots: u64,
     device: Mutex<Option<Arc<Device>>>,
     /// No device can be opened any more (set by tests).
     gone: AtomicBool,
@@ -105,10 +107,9 @@ impl Gpu {
     }
 
     fn open_with(kind: GpuKind, timed: bool) -> Result<Gpu, String> {
-        let (device, facts) = device::open(kind, timed)?;
-        let cap = facts.most_bytes;
-        let mut gpu =
-            Gpu { kind, facts, timed, cap, device: Mutex::new(Some(Arc::new(device))), gone: AtomicBool::new(false) };
+        let (device, facts) = device::open(kind, timed, SLOTS)?;
+        let (cap, gone) = (facts.most_bytes, AtomicBool::new(false));
+        let mut gpu = Gpu { kind, facts, timed, cap, slots: SLOTS, device: Mutex::new(Some(Arc::new(device))), gone };
         let name = gpu.facts.name.clone();
         let failed = |e: GpuError| format!("{name} does not compute: {e}");
         gpu.facts.exact_floats = gpu.probe().map_err(failed)?;
@@ -123,6 +124,14 @@ impl Gpu {
     /// Holds each buffer to `bytes` (at most what the adapter allows); larger calls are cut into parts.
     pub fn set_cap(&mut self, bytes: u64) {
         self.cap = bytes.min(self.facts.most_bytes);
+    }
+
+    /// Bricks that are on their way at once; more calls wait.
+    pub fn set_slots(&mut self, count: u64) {
+        self.slots = count.max(1);
+        if let Some(device) = &*self.device.lock().unwrap_or_else(|e| e.into_inner()) {
+            device.set_slots(self.slots);
+        }
     }
 
     pub(super) fn cap(&self) -> u64 {
@@ -162,7 +171,7 @@ impl Gpu {
         if self.gone.load(Ordering::Relaxed) {
             return Err(GpuError("the device was lost, and no other is there".into()));
         }
-        let opened = device::open(self.kind, self.timed);
+        let opened = device::open(self.kind, self.timed, self.slots);
         let (device, _) = opened.map_err(|e| GpuError(format!("the device was lost; {e}")))?;
         Ok(held.insert(Arc::new(device)).clone())
     }

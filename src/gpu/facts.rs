@@ -41,8 +41,13 @@ pub const MOMENTS4: &str = "no GPU kernel for method \"moments4\", whose guarant
 /// Why moments for `reduce = "moments"` stay on the CPU, but for bytes.
 pub const UNROUNDED: &str = "no GPU kernel for means in f64, which `reduce = \"moments\"` pools: runs on the CPU";
 
-/// Bricks that are on the GPU's way at once: one is packed, one computes, one is read back and finished.
+/// Bricks that are on the GPU's way at once at least: one is packed, one computes, one is read back and finished.
 pub const SLOTS: u64 = 3;
+
+/// And at most, where memory and workers allow it: results of f32 take a core longer to copy than the device to make. Streams of
+/// u8 bricks of 256^3 (H200 beside 16 cores, 2026-11-27): gradients of a Gaussian 104, 123, 144, 157 bricks/s with 3, 4, 5, 6 slots,
+/// `cdf_power` 122, 147, 175, 202.
+pub const MOST_SLOTS: u64 = 6;
 
 impl GpuFacts {
     /// Bytes to which each buffer is held, so that all of them together stay a part of `memory` (up to nine buffers' worth

@@ -6,6 +6,7 @@ use super::memory::{self, brick_bytes, parked_bytes};
 use super::tasks::{Group, input_halo};
 use super::{streams, tasks};
 use crate::config::Config;
+use crate::gpu::facts;
 use crate::grid::Shape;
 use crate::{Error, Result};
 
@@ -23,8 +24,10 @@ pub struct BrickChoice {
     pub cache: u64,
     /// Bytes for buffers that wait for the next brick, beside what bricks hold; none where there are chunks to hold instead.
     pub waiting: u64,
-    /// Bytes of open chunks of the levels.
+    /// Bytes of open chunks of the levels, and of the GPU lane's slots.
     pub parked: u64,
+    /// Bricks that the GPU lane holds at once; 0 where no step of the group runs there.
+    pub slots: u64,
     /// Input voxels read per output voxel.
     pub amplification: f64,
     pub why: String,
@@ -162,8 +165,17 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
         choice.in_flight = enough;
         choice.cache = left(&choice).min(decoded);
     }
+    let slot = memory::slot_bytes(plan, &probe);
+    if slot > 0 {
+        // More of them of half of what nothing else takes.
+        let spare = (left(&choice) - choice.cache) / 2;
+        let most = facts::MOST_SLOTS.min(plan.workers as u64).max(facts::SLOTS);
+        choice.slots = (facts::SLOTS + spare / slot).min(most);
+        choice.parked += (choice.slots - facts::SLOTS) * slot;
+    }
     if decoded == 0 {
-        choice.waiting = left(&choice).min(choice.bytes * choice.in_flight as u64);
+        let left = memory::left_bytes(plan, choice.alive(plan.workers), choice.parked);
+        choice.waiting = left.min(choice.bytes * choice.in_flight as u64);
     }
     choice.amplification = amplification(plan, group, shape);
     Some(choice)

@@ -109,15 +109,19 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
     );
     let _ = writeln!(
         w,
-        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks {}, buffers kept for the next brick {})",
+        "  peak memory at most {} of {} (bricks {}, decoded chunks {}, open chunks{} {}, buffers kept for the next brick {})",
         mib(brick.peak(plan.workers)),
         mib(plan.memory),
         mib(brick.alive(plan.workers)),
         mib(brick.cache),
+        if brick.slots > 0 { " and the GPU's slots" } else { "" },
         mib(brick.parked),
         mib(brick.waiting)
     );
     let _ = writeln!(w, "  read amplification {:.2}", brick.amplification);
+    if brick.slots > 0 {
+        let _ = writeln!(w, "  {} bricks at once on the GPU's way", plan.slots());
+    }
     for step in group.steps.iter().map(|&s| &plan.graph.steps[s]) {
         let Some(wire) = step.streamed else { continue };
         let (stages, input) = (step.stages.join("+"), &plan.graph.wires[wire].name);
@@ -269,7 +273,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
                 "skippable": skips_json(g, known.as_ref()),
                 "shape": g.shape, "region": [g.region.lo, g.region.hi], "brick": g.brick.shape, "brick_why": g.brick.why,
                 "brick_bytes": g.brick.bytes, "scratch_bytes": g.brick.scratch, "bricks_in_flight": g.brick.in_flight, "bricks": g.brick_count(),
-                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache, "waiting_bytes": g.brick.waiting,
+                "tasks": g.task_count(), "task": g.task, "cache_bytes": g.brick.cache, "waiting_bytes": g.brick.waiting, "gpu_slots": g.brick.slots,
                 "peak_memory_bytes": g.brick.peak(plan.workers), "read_amplification": g.brick.amplification,
             })
         })

@@ -160,9 +160,9 @@ fn narrowed(shape: Shape, used: bool) -> usize {
     if used { shape.iter().product::<usize>() * 12 } else { 0 }
 }
 
-/// Staging of the GPU lane for bricks of this shape, and its device buffers where they are this process's memory. Slots
+/// Staging of a slot of the GPU lane for bricks of this shape, and its device buffers where they are this process's memory. Slots
 /// stay alive between bricks.
-fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
+pub fn slot_bytes(plan: &Plan, group: &Group) -> u64 {
     let Some(gpu) = &plan.gpu else { return 0 };
     let cap = gpu.buffer_cap(plan.memory);
     let steps = group.steps.iter().filter(|&&s| plan.on_gpu(s));
@@ -177,8 +177,8 @@ fn gpu_bytes(plan: &Plan, group: &Group) -> u64 {
         let brick = Region::new(lo, std::array::from_fn(|a| lo[a] + group.brick.shape[a] as i64));
         Some(job.slot(brick.clip(&Region::whole(shape)), cap))
     });
-    facts::SLOTS
-        * sizes.chain(maps).chain(flows).fold(record::Sizes::default(), record::Sizes::max).host_bytes(gpu.software)
+    let largest = sizes.chain(maps).chain(flows).reduce(record::Sizes::max);
+    largest.map_or(0, |sizes| sizes.host_bytes(gpu.software))
 }
 
 /// A flow over a brick in the middle of its group, where it sees most; `None` where the group has none of it.
@@ -287,9 +287,9 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
 }
 
 /// Open chunks of the levels between their first and last brick, for one task, all outputs, and those that are being encoded; and
-/// the GPU lane's buffers.
+/// the least slots of the GPU lane.
 pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
-    let (mut total, mut encoding) = (gpu_bytes(plan, group), 0);
+    let (mut total, mut encoding) = (facts::SLOTS * slot_bytes(plan, group), 0);
     for &o in &group.outputs {
         let output = &plan.outputs[o];
         if !output.is_zarr() {

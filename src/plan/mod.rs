@@ -184,6 +184,11 @@ impl Plan {
         self.placement[step].1 == "gpu"
     }
 
+    /// Bricks that the GPU lane holds at once: as many as every group has room for.
+    pub fn slots(&self) -> u64 {
+        self.groups.iter().map(|g| g.brick.slots).filter(|s| *s > 0).min().unwrap_or(facts::SLOTS)
+    }
+
     /// Whether a step on the GPU gives bricks to CPU workers while all slots are taken: where results are integers or fixed
     /// point, and with `lanes = "mixed"` everywhere.
     pub fn shares(&self, step: StepId) -> bool {

@@ -28,6 +28,7 @@ pub fn plan_and_gpu(config: &Config, sources: &[Source], resume: bool) -> Result
     }
     if let Some(gpu) = &mut opened {
         gpu.set_cap(facts.buffer_cap(plan.memory));
+        gpu.set_slots(plan.slots());
     }
     Ok((infos, plan, opened))
 }

@@ -117,3 +117,23 @@ fn a_budget_does_not_move_floats_to_the_cpu() {
     let enough = error.split("memory = \"").nth(1).and_then(|rest| rest.split('"').next()).unwrap();
     assert_eq!(place(&plan(dir.path(), text, &[&format!("run.memory='{enough}'")]), "stats").0, "gpu");
 }
+
+#[test]
+fn ample_memory_and_workers_give_the_lane_more_slots() {
+    let text = "[run]\nbrick = [64, 64, 64]\n[input.vol]\nsynthetic = \"noise\"\nshape = [256, 256, 256]\ndtype = \"u16\"\n\
+                [stage.stats]\nop = \"box\"\ninput = \"vol\"\nradius = 5\n[output.o]\npath = \"out/o.zarr\"\n\
+                from = \"stats.mean\"\n";
+    let dir = folder([2, 2, 2]);
+    let slots = |threads: &str, memory: &str| {
+        let plan = plan(dir.path(), text, &[&format!("run.threads={threads}"), &format!("run.memory='{memory}'")]);
+        for group in &plan.groups {
+            assert!(group.brick.peak(plan.workers) <= plan.memory, "{threads} threads, {memory}");
+        }
+        plan.slots()
+    };
+    assert_eq!(slots("8", "2GiB"), 6);
+    assert_eq!(slots("4", "2GiB"), 4, "no more than workers");
+    assert_eq!(slots("2", "2GiB"), 3, "no fewer than keep the device busy");
+    let tight = ["96MiB", "128MiB", "160MiB", "256MiB", "512MiB"].map(|m| slots("8", m));
+    assert!(tight.is_sorted() && tight[0] == 3, "{tight:?}");
+}
