@@ -256,6 +256,35 @@ fn bricks_threads_and_budgets_never_show() {
     }
 }
 
+/// Volumes of a few voxels along an axis, whose tasks are long.
+#[test]
+fn bricks_of_thin_volumes_never_show() {
+    const THIN: &str = "[input.vol]\npath = \"vol.npy\"\n[stage.stats]\nop = \"box\"\ninput = \"vol\"\nradius = 3\n[stage.ao]\n\
+                        op = \"ambient_occlusion\"\ninput = \"vol\"\nradius = 4\nmethod = \"cdf_power\"\n[stage.sweep]\n\
+                        op = \"obscurance\"\ninput = \"vol\"\ndirections = 12\nmax_distance = 6\n[stage.map]\n\
+                        op = \"occlusion_map\"\ninput = \"vol\"\n[output.ao]\npath = \"out/ao.zarr\"\nfrom = \"ao\"\n\
+                        chunk = 16\nshard = 64\n[output.variance]\npath = \"out/variance.npy\"\nfrom = \"stats.variance\"\n\
+                        [output.sweep]\npath = \"out/sweep.zarr\"\nfrom = \"sweep\"\nreduce = \"stride\"\n[output.map]\n\
+                        path = \"out/map.zarr\"\nfrom = \"map\"\n";
+    for shape in [[1, 2, 12_000], [3, 120, 210], [3000, 5, 2]] {
+        let dir = tempfile::tempdir().unwrap();
+        write_npy(&dir.path().join("vol.npy"), "<u2", shape, &u16_bytes(&mixed_u16(shape)));
+        let of = |sets: &[&str]| {
+            run(dir.path(), THIN, sets);
+            ["ao.zarr", "variance.npy", "sweep.zarr", "map.zarr"].map(|name| one(&dir.path().join("out").join(name)))
+        };
+        let first = of(&[]);
+        for sets in
+            [&["run.brick=[8, 8, 512]", "run.threads=3"][..], &["run.brick=[64, 64, 16]"], &["run.memory=64MiB"]]
+        {
+            for (a, b) in first.iter().zip(&of(sets)) {
+                assert_same(&format!("{shape:?} with {sets:?}"), &a.0, &b.0);
+                assert_eq!(a.1, b.1, "metadata of {shape:?} with {sets:?}");
+            }
+        }
+    }
+}
+
 #[test]
 fn a_chain_of_stages_is_the_chain_of_their_runs() {
     let dir = volume();

@@ -476,6 +476,33 @@ fn bare_numbers_in_zarr_attributes_are_no_error() {
     assert!(whole(&file_input(&array), 0).unwrap_err().to_string().contains("broken JSON"));
 }
 
+/// n5-zarr writes numbers as text, others integers with a point; zarr-python reads both.
+#[test]
+fn fill_values_of_zarr_v2_as_writers_have_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(".zarray");
+    let of = |dtype: &str, fill: serde_json::Value| {
+        let meta = json!({
+            "zarr_format": 2, "shape": [1, 1, 3], "chunks": [1, 1, 2], "dtype": dtype, "order": "C", "fill_value": fill,
+            "filters": null, "compressor": null,
+        });
+        fs::write(&path, meta.to_string()).unwrap();
+        whole(&file_input(folder.path()), 0).map(|r| r.1).map_err(|e| e.to_string())
+    };
+    let all = |v: u16| Ok(Voxels::U16(vec![v; 3]));
+    for (fill, expected) in
+        [(json!("0"), 0), (json!(" 7 "), 7), (json!(5.0), 5), (json!("65535"), 65535), (json!(9), 9), (json!(null), 0)]
+    {
+        assert_eq!(of("<u2", fill.clone()), all(expected), "{fill}");
+    }
+    assert_eq!(of("|i1", json!("-3.0")), Ok(Voxels::I8(vec![-3; 3])));
+    assert_eq!(of("<f4", json!("0.25")), Ok(Voxels::F32(vec![0.25; 3])));
+    assert_eq!(of("<f8", json!("-Infinity")), Ok(Voxels::F64(vec![f64::NEG_INFINITY; 3])));
+    for fill in [json!(0.5), json!("70000"), json!(-1), json!("seven")] {
+        assert!(of("<u2", fill.clone()).unwrap_err().contains("fill value"), "{fill}");
+    }
+}
+
 #[test]
 fn an_array_in_memory_reads_like_a_file() {
     let voxels = Voxels::I16((0..120).map(|i| expected([4, 5, 6], 0)(i) as i16).collect());

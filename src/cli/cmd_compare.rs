@@ -2,15 +2,16 @@
 
 use std::process::ExitCode;
 
+use rayon::prelude::*;
 use serde_json::json;
 
 use super::args::CompareArgs;
 use super::moments::{Magnitudes, Moments};
 use super::progress::{Count, Shown};
-use super::reader::Volume;
+use super::reader::{Planes, Volume};
+use super::similarity::Ssim;
 use super::{human, messages, usage};
 use crate::Result;
-use crate::kernel::ssim::Ssim;
 use crate::run::{Cancel, Progress};
 
 /// How two volumes differ, over the voxels that both have.
@@ -84,23 +85,31 @@ pub fn compare(a: &Volume, b: &Volume, cancel: &Cancel, progress: &dyn Progress)
     };
     let mut count = Count::new(progress, "compare", components * ia.voxels());
     let mut sums = Sums::default();
-    let mut plane = [0, 1].map(|_| vec![0.0; ia.shape[1] * ia.shape[2]]);
+    let pair = || [0, 1].map(|_| vec![0.0; ia.shape[1] * ia.shape[2]]);
+    let (mut here, mut ahead) = (pair(), pair());
     for component in 0..components {
-        let (mut pa, mut pb) = (a.planes(component)?, b.planes(component)?);
+        let mut planes = [a.planes(component)?, b.planes(component)?];
         let mut similarity = Ssim::new([ia.shape[1], ia.shape[2]], range);
-        loop {
+        let mut more = next_pair(&mut planes, &mut here)?;
+        while more {
             cancel.check()?;
-            let [va, vb] = &mut plane;
-            if !(pa.next(va)? && pb.next(vb)?) {
-                break;
-            }
-            sums.add(va, vb);
-            similarity.push_plane(va, vb);
+            let [va, vb] = &here;
+            let read = || next_pair(&mut planes, &mut ahead);
+            let take = || rayon::join(|| sums.add(va, vb), || similarity.push_plane(va, vb));
+            let (read, _) = rayon::join(read, take);
+            more = read?;
             count.add(va.len());
+            std::mem::swap(&mut here, &mut ahead);
         }
         sums.similar(similarity.finish());
     }
     Ok(sums.finish())
+}
+
+/// The next plane of both volumes; false after the last.
+fn next_pair(planes: &mut [Planes; 2], into: &mut [Vec<f64>; 2]) -> Result<bool> {
+    let ([pa, pb], [va, vb]) = (planes, into);
+    Ok(pa.next(va)? && pb.next(vb)?)
 }
 
 /// Largest minus least finite value of all components; 1 of a constant, so that equal constants are alike.
@@ -111,6 +120,41 @@ fn value_range(volume: &Volume, components: usize, cancel: &Cancel, progress: &d
         volume.each_plane(component, cancel, &mut count, &mut |plane| all = all.merge(Moments::of(plane)))?;
     }
     Ok(all.dynamic_range())
+}
+
+/// Pairs that are summed at a time.
+const BLOCK: usize = 1 << 14;
+
+/// Sums over the pairs of a block.
+struct Block {
+    /// Of A - B.
+    signed: Moments,
+    absolute: f64,
+    squares: f64,
+    max_abs: f64,
+    missing: [u64; 2],
+}
+
+/// A - B; 0 of equal infinities.
+fn difference(a: f64, b: f64) -> f64 {
+    if a == b { 0.0 } else { a - b }
+}
+
+impl Block {
+    fn of(a: &[f64], b: &[f64]) -> Block {
+        let all: Vec<f64> = a.iter().zip(b).map(|(a, b)| difference(*a, *b)).collect();
+        let mut block = Block { signed: Moments::of(&all), absolute: 0.0, squares: 0.0, max_abs: 0.0, missing: [0; 2] };
+        for d in all.iter().filter(|d| !d.is_nan()) {
+            block.absolute += d.abs();
+            block.squares += d * d;
+            block.max_abs = block.max_abs.max(d.abs());
+        }
+        for (a, b) in a.iter().zip(b) {
+            block.missing[0] += u64::from(a.is_nan() && !b.is_nan());
+            block.missing[1] += u64::from(b.is_nan() && !a.is_nan());
+        }
+        block
+    }
 }
 
 /// Running sums over pairs.
@@ -128,24 +172,22 @@ pub struct Sums {
 }
 
 impl Sums {
-    /// Takes in pairs; those with a NaN do not count.
+    /// Takes in pairs; those with a NaN do not count. Blocks are summed side by side and taken in in order, so that nothing
+    /// depends on the threads and long volumes lose no digits.
     pub fn add(&mut self, a: &[f64], b: &[f64]) {
-        let difference: Vec<f64> = a.iter().zip(b).map(|(a, b)| if a == b { 0.0 } else { a - b }).collect();
-        // Sums per plane, so that long volumes lose no digits.
-        let (mut absolute, mut squares) = (0.0, 0.0);
-        for d in difference.iter().filter(|d| !d.is_nan()) {
-            let magnitude = d.abs();
-            absolute += magnitude;
-            squares += magnitude * magnitude;
-            self.max_abs = self.max_abs.max(magnitude);
-            self.magnitudes.add(magnitude);
-        }
-        self.absolute += absolute;
-        self.squares += squares;
-        self.signed = self.signed.merge(Moments::of(&difference));
-        for (a, b) in a.iter().zip(b) {
-            self.missing[0] += u64::from(a.is_nan() && !b.is_nan());
-            self.missing[1] += u64::from(b.is_nan() && !a.is_nan());
+        let magnitudes = &mut self.magnitudes;
+        let count = || {
+            let all = a.iter().zip(b).map(|(a, b)| difference(*a, *b).abs());
+            all.filter(|d| !d.is_nan()).for_each(|d| magnitudes.add(d));
+        };
+        let sum = || a.par_chunks(BLOCK).zip(b.par_chunks(BLOCK)).map(|(a, b)| Block::of(a, b)).collect();
+        let (_, blocks): ((), Vec<Block>) = rayon::join(count, sum);
+        for block in blocks {
+            self.absolute += block.absolute;
+            self.squares += block.squares;
+            self.max_abs = self.max_abs.max(block.max_abs);
+            self.signed = self.signed.merge(block.signed);
+            (0..2).for_each(|k| self.missing[k] += block.missing[k]);
         }
     }
 

@@ -16,6 +16,7 @@ pub mod plot;
 pub mod process;
 pub mod progress;
 pub mod reader;
+mod similarity;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

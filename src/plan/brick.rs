@@ -248,11 +248,11 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     };
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels (the same runs: 77 ms of kernel in bricks of
     // 2 million, 85 of 4, 95 of 8); beyond, the pipeline only gets coarser.
-    let voxels = shape.iter().product::<usize>() as f64;
+    let voxels = (0..3).map(|a| shape[a].min(region[a])).product::<usize>() as f64;
     let large = 1.0 + voxels / 40e6 + (voxels / 16e6).powi(2) * 0.1;
     let partial_chunks =
         if (0..3).any(|a| !shape[a].is_multiple_of(group.chunk[a]) && shape[a] < region[a]) { 1.15 } else { 1.0 };
-    let overhead = 1.0 + 20_000.0 / shape.iter().product::<usize>() as f64;
+    let overhead = 1.0 + 20_000.0 / voxels;
     streams::work(plan, group, choice.amplification) * rounds * short_rows * starved * large * partial_chunks * overhead
 }
 

@@ -1,7 +1,8 @@
 //! Volumes cut into super-blocks (tasks) and bricks.
 //!
-//! A task owns whole shards of level 0 and of as many further levels as fit in about one of [`TASK_EDGES`] voxels per axis. It
-//! depends on shapes, halos, chunks and shards only, never on bricks, threads or budget, so that a resumed run may change those.
+//! A task owns whole shards of level 0 and of as many further levels as fit in about one of [`TASK_EDGES`] voxels per axis, and of
+//! thin volumes more. It depends on shapes, halos, chunks and shards only, never on bricks, threads or budget, so that a resumed
+//! run may change those.
 
 use super::graph::Graph;
 use super::graph::{StepId, WireId, add3, max3};
@@ -270,7 +271,29 @@ fn choose_task(outputs: &[&OutputPlan], base: Shape, region: Shape, halo: usize)
     let whole: usize = region.iter().product();
     let most = |task: &Shape| (0..3).map(|a| task[a].min(region[a])).product::<usize>();
     let least = shapes.clone().next_back().filter(|task| most(task) * 4 <= whole * 3);
-    shapes.clone().find(|task| most(task) * LEAST_TASKS <= whole).or(least).or(shapes.clone().next()).unwrap_or(base)
+    let task = shapes
+        .clone()
+        .find(|task| most(task) * LEAST_TASKS <= whole)
+        .or(least)
+        .or(shapes.clone().next())
+        .unwrap_or(base);
+    lengthened(task, region)
+}
+
+/// Twice as long along its shortest axis that can grow, as often as it stays one in [`LEAST_TASKS`] of the voxels and no more than
+/// a cube of the first of [`TASK_EDGES`]: of volumes that are thin along some axis, a cube holds little.
+fn lengthened(mut task: Shape, region: Shape) -> Shape {
+    let voxels = |s: Shape| (0..3).map(|a| s[a].min(region[a])).fold(1usize, usize::saturating_mul);
+    let most = (region.iter().product::<usize>() / LEAST_TASKS).min(TASK_EDGES[0].pow(3));
+    loop {
+        let Some(axis) = (0..3).rev().filter(|&a| task[a] < region[a]).min_by_key(|&a| task[a]) else { return task };
+        let mut next = task;
+        next[axis] = next[axis].saturating_mul(2);
+        if voxels(next) > most {
+            return task;
+        }
+        task = next;
+    }
 }
 
 /// Grows a task from the files of level 0 to those of further levels while it stays near `edge`.
@@ -323,4 +346,32 @@ fn lcm3(a: Shape, b: Shape) -> Shape {
         if b == 0 { a } else { gcd(b, a % b) }
     }
     std::array::from_fn(|i| (a[i] / gcd(a[i], b[i])).saturating_mul(b[i]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Voxels of the largest task, and how many there are.
+    fn sizes(task: Shape, region: Shape) -> (usize, usize) {
+        ((0..3).map(|a| task[a].min(region[a])).product(), (0..3).map(|a| region[a].div_ceil(task[a])).product())
+    }
+
+    #[test]
+    fn tasks_of_thin_volumes_are_long() {
+        let long = lengthened([512; 3], [1, 1, 100_000_000]);
+        assert_eq!((long, sizes(long, [1, 1, 100_000_000])), ([512, 512, 1 << 23], (1 << 23, 12)));
+        let flat = lengthened([512; 3], [1, 10_000, 10_000]);
+        assert_eq!((flat, sizes(flat, [1, 10_000, 10_000]).1), ([512, 2048, 4096], 15));
+        // Never more than a cube holds, and whole files.
+        let sheet = lengthened([384; 3], [64, 100_000, 100_000]);
+        assert!(sizes(sheet, [64, 100_000, 100_000]).0 <= 512usize.pow(3) && sheet.iter().all(|n| n % 384 == 0));
+        assert!(sizes(sheet, [64, 100_000, 100_000]).0 > 256usize.pow(3));
+        // Volumes that are not thin keep their cubes, small ones their task.
+        for (task, region) in
+            [([512; 3], [4096; 3]), ([64; 3], [128; 3]), ([32; 3], [30, 31, 32]), ([512; 3], [600; 3])]
+        {
+            assert_eq!(lengthened(task, region), task, "{region:?}");
+        }
+    }
 }

@@ -22,7 +22,8 @@ pub struct RunOptions {
 
 /// Told how far a run is. Called from any thread, at most a few times a second per thread.
 pub trait Progress: Sync {
-    /// Level-0 voxels and bricks that are done, of all that there are to do; `phase` names what goes on (`unpack`, `compute`).
+    /// Level-0 voxels and bricks that are done, of all that there are to do; `phase` names what goes on: `unpack`
+    /// (bytes), `compute`, `levels` (voxels of the levels that bricks do not make).
     fn update(&self, done_voxels: u64, total_voxels: u64, bricks_done: u64, bricks_total: u64, phase: &str);
     /// Something that the user should know, once.
     fn note(&self, text: &str);

@@ -18,31 +18,49 @@ use crate::kernel::simd::Level;
 use crate::plan::OutputPlan;
 use crate::store::Spill;
 
-/// Finishes all levels of one output. Idempotent: a second phase that was killed or cancelled is simply done again.
+/// Finishes all levels of one output. Idempotent: a second phase that was killed or cancelled is simply done again. `made` hears of
+/// the voxels of every chunk, [`voxels`] of them together.
 pub fn finish_levels(
     output: &OutputPlan,
     target: &Target,
     work_dir: &Path,
     pool: &rayon::ThreadPool,
     cancel: &Cancel,
+    made: &(dyn Fn(usize) + Sync),
 ) -> Result<u64> {
+    let one = |region: Region| {
+        cancel.check()?;
+        made(region.voxels());
+        Ok(())
+    };
     pool.install(|| {
         let mut bytes = 0;
         for k in output.first_level()..=output.brick_level() {
             if let Some(spill) = &target.levels[k] {
-                bytes += shared_level(output, target, spill, k, cancel)?;
+                bytes += shared_level(output, target, spill, k, &one)?;
             }
         }
         let mut fine = None;
         for k in output.brick_level() + 1..output.level_count() {
             let spill = fine.as_ref().or(target.cells.as_ref()).expect("cells were kept for the levels beyond");
-            let (written, next) = coarse_level(output, target, spill, work_dir, k, cancel)?;
+            let (written, next) = coarse_level(output, target, spill, work_dir, k, &one)?;
             bytes += written;
             fine = Some(next);
         }
         Ok(bytes)
     })
 }
+
+/// Voxels that the second phase makes of an output, each component and map counted once.
+pub fn voxels(output: &OutputPlan, target: &Target) -> usize {
+    let of = |k: usize| output.level(k).expect("level exists").shape.iter().product::<usize>();
+    let shared = (output.first_level()..=output.brick_level()).filter(|&k| target.levels[k].is_some());
+    let coarse = output.brick_level() + 1..output.level_count();
+    components(output) * shared.map(of).sum::<usize>() + coarse.map(of).sum::<usize>()
+}
+
+/// Before each chunk: an error stops the phase.
+type Before<'a> = &'a (dyn Fn(Region) -> Result<()> + Sync);
 
 /// Boxes of the chunks of level `k`.
 fn chunks(output: &OutputPlan, k: usize) -> Vec<Region> {
@@ -56,10 +74,10 @@ fn components(output: &OutputPlan) -> usize {
 }
 
 /// Encodes a level whose rounded voxels tasks left in scratch.
-fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize, cancel: &Cancel) -> Result<u64> {
+fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize, before: Before) -> Result<u64> {
     let dataset = k - output.first_level();
     let one = |(component, region): (usize, Region)| {
-        cancel.check()?;
+        before(region)?;
         let mut voxels = Voxels::zeroed(output.spec.dtype, region.voxels());
         spill.read(component, region, voxels.as_bytes_mut());
         let chunk = target.sink.encode(dataset, region, voxels.view(region.shape()))?;
@@ -79,7 +97,7 @@ fn coarse_level(
     fine: &Spill,
     work_dir: &Path,
     k: usize,
-    cancel: &Cancel,
+    before: Before,
 ) -> Result<(u64, Spill)> {
     let layout = output.level(k).expect("level exists");
     let per_component = if output.map.is_some() { 2 } else { components(output) * planes(output.reduce) };
@@ -88,7 +106,7 @@ fn coarse_level(
     let bytes = regions
         .into_par_iter()
         .map(|region| {
-            cancel.check()?;
+            before(region)?;
             match output.map {
                 Some(_) => map_chunk(output, target, fine, &next, k, region),
                 None => cells_chunk(output, target, fine, &next, k, region),

@@ -434,6 +434,17 @@ impl<'a> Session<'a> {
         }
     }
 
+    /// Before each chunk of the second phase, ten times a second at most.
+    fn tick_levels(&self, done: u64, all: u64) {
+        let now = (self.metrics.seconds() * 1e3) as u64;
+        let last = self.last_tick.load(Ordering::Relaxed);
+        let due = now >= last + 100;
+        if due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok() {
+            self.metrics.sample_memory();
+            self.progress.update(done, all, 0, 0, "levels");
+        }
+    }
+
     /// The second phase and the attributes; then the outputs are complete.
     pub fn finish(mut self) -> Result<Report> {
         let open = self.done.iter().filter(|d| !is_done(d)).count();
@@ -441,11 +452,18 @@ impl<'a> Session<'a> {
             return Err(Error::Failed(format!("{open} of {} tasks are not done", self.done.len())));
         }
         let start = Instant::now();
+        let open = || self.plan.outputs.iter().zip(&self.targets).filter_map(|(o, t)| Some((o, t.as_ref()?)));
+        let all = open().map(|(o, t)| second::voxels(o, t)).sum::<usize>() as u64;
+        let done = AtomicU64::new(0);
         for o in 0..self.plan.outputs.len() {
             let Some(target) = self.targets[o].take() else { continue };
             let output = &self.plan.outputs[o];
             let dir = Sink::work_dir(&output.spec.path);
-            let bytes = second::finish_levels(output, &target, &dir, &self.threads, &self.options.cancel)?;
+            let made = |voxels: usize| {
+                let before = done.fetch_add(voxels as u64, Ordering::Relaxed);
+                self.tick_levels(before, all);
+            };
+            let bytes = second::finish_levels(output, &target, &dir, &self.threads, &self.options.cancel, &made)?;
             self.metrics.bytes_written(bytes);
             let attributes = outputs::attributes(
                 self.config,

@@ -7,10 +7,10 @@ use serde_json::json;
 use super::super::cmd_compare::{Difference, Sums};
 use super::super::moments::{Magnitudes, Moments};
 use super::super::reader::{Volume, read_box};
+use super::super::similarity::Ssim;
 use super::sample::Judged;
 use crate::Result;
 use crate::grid::Shape;
-use crate::kernel::ssim::Ssim;
 use crate::run::Cancel;
 
 /// Share of the voxels that the surface band leaves out.

@@ -224,6 +224,7 @@ fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> 
     let outer = sizes(path, "chunks", &value["chunks"], Some(shape.len()), 1)?;
     let descr = value["dtype"].as_str().ok_or_else(|| refuse(path, "a structured type"))?;
     let dtype = numpy_type(path, descr)?.1;
+    plain_fill(dtype, &mut value["fill_value"]);
     let filters = value["filters"].as_array().map_or(&[][..], |l| l);
     let ids = filters.iter().chain([&value["compressor"]]).filter_map(|c| c["id"].as_str());
     let codecs: Vec<String> = ids.map(str::to_string).collect();
@@ -246,6 +247,22 @@ fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> 
     };
     check_chunk(path, &meta)?;
     Ok(meta)
+}
+
+/// A fill value of Zarr v2 as the specification has it. zarr-python takes more, and writers rely on it: numbers as text (n5-zarr),
+/// integers with a point.
+fn plain_fill(dtype: DType, fill: &mut Value) {
+    let number = match fill {
+        Value::String(text) => text.trim().parse::<f64>().ok(),
+        Value::Number(number) => number.as_f64(),
+        _ => None,
+    };
+    let Some(v) = number.filter(|v| v.is_finite()) else { return };
+    if dtype.is_float() {
+        *fill = Value::from(v);
+    } else if v.fract() == 0.0 && dtype.range().0 <= v && v <= dtype.range().1 {
+        *fill = Value::from(v as i64);
+    }
 }
 
 fn short(name: &str) -> &str {
