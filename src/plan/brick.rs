@@ -165,12 +165,11 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
         choice.in_flight = enough;
         choice.cache = left(&choice).min(decoded);
     }
+    // More slots of the GPU lane of half of what nothing else takes.
     let slot = memory::slot_bytes(plan, &probe);
-    if slot > 0 {
-        // More of them of half of what nothing else takes.
-        let spare = (left(&choice) - choice.cache) / 2;
+    if let Some(more) = ((left(&choice) - choice.cache) / 2).checked_div(slot) {
         let most = facts::MOST_SLOTS.min(plan.workers as u64).max(facts::SLOTS);
-        choice.slots = (facts::SLOTS + spare / slot).min(most);
+        choice.slots = (facts::SLOTS + more).min(most);
         choice.parked += (choice.slots - facts::SLOTS) * slot;
     }
     if decoded == 0 {

@@ -276,10 +276,16 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
     let level_1 = if output.level_count() > 1 { voxels / 8 } else { 0 };
     let cells = 2 * level_1 * reduce::bytes_per_cell(output.reduce) as u64;
     let map = match &output.map {
-        // Mean and variance of the grown brick, of the level below and of the passes between.
+        // Mean and variance of the grown brick or of blocks of it and the level below, and the passes between.
         Some(m) => {
-            let halo = input_halo(plan, group, m.source);
-            grown(brick, halo, group.shape).iter().map(|&n| n as u64).product::<u64>() * 16 * 3
+            let [nz, ny, nx] = grown(brick, input_halo(plan, group, m.source), group.shape).map(|n| n as u64);
+            if m.by_blocks(output.brick_level()) {
+                let [z, y] = super::MAP_BLOCK.map(|n| 2 * n as u64 + 4);
+                let factor = m.chain.levels[1].factor.iter().map(|&f| f as u64).product::<u64>();
+                (nz.min(z) * ny.min(y) * nx + (nz * ny * nx).div_ceil(factor)) * 24
+            } else {
+                nz * ny * nx * 16 * 3
+            }
         }
         None => 0,
     };

@@ -21,7 +21,7 @@ use graph::{GlobalId, Graph, StepId, WireId};
 pub use brick::BrickChoice;
 pub use explain::explain;
 pub use flows::FlowPlan;
-pub use outputs::{MapPlan, OutputPlan};
+pub use outputs::{MAP_BLOCK, MapPlan, OutputPlan};
 pub use tasks::Group;
 
 use crate::config::{Config, Device, Lanes};

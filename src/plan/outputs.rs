@@ -49,6 +49,17 @@ pub struct MapPlan {
     pub chain: Pyramid,
 }
 
+/// Planes and rows of level 1 that are made of level 0 at a time, where nobody stores that. 2-core Xeon VM, AVX-512, 2026-11-28, a
+/// map, `cdf_power` and a mean of 1024 x 1024 x 512 u8 under 256 MiB: 11.5 s, of whole planes 12.9, of the whole brick 14.5.
+pub const MAP_BLOCK: [usize; 2] = [8, 32];
+
+impl MapPlan {
+    /// Whether bricks whose last level is `last` make level 1 block by block, and level 0 is never there as a whole.
+    pub fn by_blocks(&self, last: usize) -> bool {
+        self.first > 0 && last > 0
+    }
+}
+
 /// Plans all outputs; may add pre-passes.
 pub fn plan_outputs(config: &Config, infos: &[VolumeInfo], lowered: &mut Lowered) -> Result<Vec<OutputPlan>> {
     (0..config.outputs.len())

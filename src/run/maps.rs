@@ -10,7 +10,7 @@ use crate::grid::{AnyView, Region, View};
 use crate::kernel::Context;
 use crate::kernel::convert::convert_at;
 use crate::kernel::occlusion_map::{Moments, base, coarsen, needed};
-use crate::plan::{MapPlan, OutputPlan};
+use crate::plan::{MAP_BLOCK, MapPlan, OutputPlan};
 use crate::{Error, Result};
 
 /// Makes every level of the map that the brick owns; cells of the last one are kept for the levels beyond.
@@ -55,9 +55,11 @@ pub fn assemble(
         made.last.iter().for_each(|m| keep(target, m, boxes[last], boxes[last]));
         return Ok(());
     }
-    let mut moments = base();
-    for k in 0..=last {
-        if k > 0 {
+    // Where nobody stores level 0, it is never there as a whole.
+    let from = usize::from(map.by_blocks(last));
+    let mut moments = if from == 1 { level_1(assembler, output, map, done, boxes[1], &mut cx) } else { base() };
+    for k in from..=last {
+        if k > from {
             let layout = &map.chain.levels;
             let mut coarse = room(assembler.pool, boxes[k]);
             coarsen(&moments, boxes[k - 1], layout[k - 1].shape, layout[k].halved, boxes[k], &mut coarse, &mut cx);
@@ -73,6 +75,36 @@ pub fn assemble(
     }
     give_back(assembler.pool, moments);
     Ok(())
+}
+
+/// Level 1 of the chain over `region`, block by block from level 0.
+fn level_1(
+    assembler: &Assembler,
+    output: &OutputPlan,
+    map: &MapPlan,
+    done: &Finished,
+    region: Region,
+    cx: &mut Context,
+) -> Moments {
+    let (pool, layout) = (assembler.pool, &map.chain.levels);
+    let mut made = room(pool, region);
+    let [_, ny, nx] = region.shape();
+    let cells = [MAP_BLOCK[0], MAP_BLOCK[1], nx.max(1)];
+    for block in region.cells(region.lo, cells).iter().map(|i| Region::of_cell(i, region.lo, cells).clip(&region)) {
+        let read = needed(block, layout[1].halved, layout[0].shape);
+        let (fine, mut coarse) = (base_level(assembler, output, map, done, read), room(pool, block));
+        coarsen(&fine, read, layout[0].shape, layout[1].halved, block, &mut coarse, cx);
+        // Whole rows, which lie one after the other in both.
+        let ([z, y, _], rows) = (region.offset_of(&block), block.shape()[1] * nx);
+        for k in 0..block.shape()[0] {
+            let (to, from) = (((z + k) * ny + y) * nx, k * rows);
+            made.mean[to..to + rows].copy_from_slice(&coarse.mean[from..from + rows]);
+            made.variance[to..to + rows].copy_from_slice(&coarse.variance[from..from + rows]);
+        }
+        give_back(pool, fine);
+        give_back(pool, coarse);
+    }
+    made
 }
 
 /// Room for the cells of a box.
