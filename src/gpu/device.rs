@@ -191,6 +191,16 @@ impl Device {
         slots.resize_with(count as usize, Slot::default);
     }
 
+    /// Makes the slots that nobody holds empty.
+    pub fn let_go(&self) {
+        self.slots.lock().unwrap_or_else(|e| e.into_inner()).iter_mut().for_each(Slot::clear);
+    }
+
+    /// Bytes of the slots that nobody holds.
+    pub fn idle_bytes(&self) -> u64 {
+        self.slots.lock().unwrap_or_else(|e| e.into_inner()).iter().map(Slot::bytes).sum()
+    }
+
     /// Waits for a free slot.
     pub fn take_slot(&self) -> SlotGuard<'_> {
         let mut slots = self.slots.lock().unwrap_or_else(|e| e.into_inner());

@@ -134,6 +134,19 @@ impl Gpu {
         }
     }
 
+    /// Lets go of the buffers of the bricks before, whose shapes no brick may have again; calls on their way keep theirs.
+    pub fn let_go(&self) {
+        if let Some(device) = &*self.device.lock().unwrap_or_else(|e| e.into_inner()) {
+            device.let_go();
+        }
+    }
+
+    /// Bytes of the buffers that wait for the next brick, the device's and the host's.
+    pub fn idle_bytes(&self) -> u64 {
+        let held = self.device.lock().unwrap_or_else(|e| e.into_inner()).clone();
+        held.map_or(0, |d| d.idle_bytes())
+    }
+
     pub(super) fn cap(&self) -> u64 {
         self.cap
     }

@@ -59,6 +59,12 @@ impl Slot {
         }
     }
 
+    /// Bytes of all buffers.
+    pub fn bytes(&self) -> u64 {
+        let own = [&self.upload, &self.params, &self.tables, &self.source, &self.read];
+        own.into_iter().chain(&self.work).map(|held| held.bytes).sum()
+    }
+
     /// Forgets every buffer, so that the next use makes new ones (after an error a buffer may be mapped or invalid).
     pub fn clear(&mut self) {
         *self = Slot::default();

@@ -1,6 +1,6 @@
 //! A run as library calls: open, `run_task(i)` in any order, finish.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use serde_json::{Value, json};
@@ -58,6 +58,8 @@ pub struct Session<'a> {
     trace: Trace,
     /// Folders to remove at the end.
     last_tick: AtomicU64,
+    /// Whose bricks the GPU's slots were made for.
+    last_group: AtomicUsize,
 }
 
 fn is_done(task: &AtomicBool) -> bool {
@@ -141,6 +143,7 @@ impl<'a> Session<'a> {
             pool: Pool::default(),
             trace: Trace::new(options.trace.is_some()),
             last_tick: AtomicU64::new(0),
+            last_group: AtomicUsize::new(usize::MAX),
         };
         session.prepare(start, header)?;
         session.plan.groups.iter().for_each(|g| session.count_resumed(g));
@@ -263,6 +266,9 @@ impl<'a> Session<'a> {
 
     fn stream_group(&self, g: usize, tasks: &[usize], only: Option<&[Region]>) -> Result<()> {
         let group = &self.plan.groups[g];
+        if let Some(gpu) = self.gpu.as_ref().filter(|_| self.last_group.swap(g, Ordering::Relaxed) != g) {
+            gpu.let_go();
+        }
         let program = Program::of_group(&self.plan, group);
         let engine = self.engine();
         let mut work = Vec::new();

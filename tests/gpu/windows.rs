@@ -229,6 +229,22 @@ fn a_lost_device_is_opened_anew() {
     }
 }
 
+/// Bricks of one group are of no use to the next one's, whose budget does not count them.
+#[test]
+fn buffers_are_let_go_and_made_anew() {
+    let Some(mut gpu) = adapter() else { return };
+    let shape = [12, 12, 33];
+    let (name, volume) = fills(DType::U16, shape).swap_remove(0);
+    for slots in [3, 1, 5] {
+        gpu.set_slots(slots);
+        check(&gpu, name, &volume, shape, &params([2; 3]), ([0; 3], shape));
+        assert!(gpu.idle_bytes() > 2 * volume.as_bytes().len() as u64, "{slots} slots hold what a brick needs");
+        gpu.let_go();
+        assert_eq!(gpu.idle_bytes(), 0);
+    }
+    check(&gpu, name, &volume, shape, &params([3; 3]), ([0; 3], shape));
+}
+
 #[test]
 fn the_comparison_can_fail() {
     let shape = [4, 5, 6];

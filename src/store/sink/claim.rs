@@ -55,6 +55,8 @@ impl Drop for Claim {
         if self.holds() {
             let _ = fs::remove_dir(&self.dir);
         }
+        // Said aloud: a child of this process that is not yet another program has the folder open, too, and would keep the lock.
+        let _ = self.file.unlock();
     }
 }
 
@@ -82,6 +84,10 @@ mod tests {
         fs::create_dir(Sink::work_dir(&path)).unwrap();
         fs::write(Sink::work_dir(&path).join("run.json"), "{}").unwrap();
         drop(Claim::existing(&path).unwrap().unwrap());
+        let claim = Claim::existing(&path).unwrap().unwrap();
+        let of_a_child = claim.file.try_clone().unwrap();
+        drop(claim);
         assert!(Claim::existing(&path).unwrap().is_some());
+        drop(of_a_child);
     }
 }
