@@ -423,8 +423,9 @@ fn awake<T>(gpu: &Gpu, mut call: impl FnMut() -> T) -> Vec<T> {
     (0..2 + ROUNDS).map(one).skip(2).collect()
 }
 
-/// Bricks per second with as many threads as the ring has slots at most, beside one thread and beside the slowest phase alone. Every thread
-/// makes a brick before the clock starts: a stream is long, and what it waits for once are its slots' buffers and their pages.
+/// Bricks per second with as many threads as the ring has slots at most, beside one thread and beside the slowest phase alone.
+/// Every thread makes a brick before the clock starts: a stream is long, and what it waits for once are its slots' buffers and
+/// their pages.
 fn stream(gpu: &Gpu, case: &Case, volume: &Voxels, shape: Shape) {
     const BRICKS: usize = 48;
     let run = |gpu: Option<&Gpu>, threads: usize| {

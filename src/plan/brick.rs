@@ -2,7 +2,7 @@
 
 use super::Plan;
 use super::graph::Producer;
-use super::memory::{self, brick_bytes, parked_bytes};
+use super::memory::{self, brick_bytes, parked_bytes, slot_bytes};
 use super::tasks::{Group, input_halo};
 use super::{streams, tasks};
 use crate::config::Config;
@@ -147,14 +147,15 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
     let bytes = brick_bytes(plan, group, shape);
     let mut probe = group.clone();
     probe.brick.shape = shape;
-    let parked = parked_bytes(plan, &probe);
+    let slot = slot_bytes(plan, &probe);
+    let parked = parked_bytes(plan, &probe) + facts::SLOTS * slot;
     let fixed = memory::FIXED + memory::PER_THREAD * plan.workers as u64;
     let room = plan.memory.checked_sub(fixed + parked)?;
     let mut choice = BrickChoice { shape, bytes, parked, why, ..BrickChoice::default() };
     choice.scratch = memory::scratch_bytes(plan, group, shape);
     let fits = |n: &usize| BrickChoice { in_flight: *n, ..choice.clone() }.alive(plan.workers) <= room;
     choice.in_flight = (1..=memory::in_flight(plan.workers)).rev().find(fits)?;
-    let left = |c: &BrickChoice| memory::left_bytes(plan, c.alive(plan.workers), parked);
+    let left = |c: &BrickChoice| memory::left_bytes(plan, c.alive(plan.workers), c.parked);
     let decoded = memory::decoded_bytes(plan, group);
     choice.cache = left(&choice).min(decoded);
     // One brick beyond the workers keeps them busy; more only smooth the flow, and a cache that loses the chunks between two
@@ -166,15 +167,12 @@ fn fit(plan: &Plan, group: &Group, shape: Shape, why: String) -> Option<BrickCho
         choice.cache = left(&choice).min(decoded);
     }
     // More slots of the GPU lane of half of what nothing else takes.
-    let slot = memory::slot_bytes(plan, &probe);
     if let Some(more) = ((left(&choice) - choice.cache) / 2).checked_div(slot) {
-        let most = facts::MOST_SLOTS.min(plan.workers as u64).max(facts::SLOTS);
-        choice.slots = (facts::SLOTS + more).min(most);
+        choice.slots = (facts::SLOTS + more).min(facts::MOST_SLOTS).min(plan.workers as u64);
         choice.parked += (choice.slots - facts::SLOTS) * slot;
     }
     if decoded == 0 {
-        let left = memory::left_bytes(plan, choice.alive(plan.workers), choice.parked);
-        choice.waiting = left.min(choice.bytes * choice.in_flight as u64);
+        choice.waiting = left(&choice).min(choice.bytes * choice.in_flight as u64);
     }
     choice.amplification = amplification(plan, group, shape);
     Some(choice)
@@ -247,7 +245,7 @@ fn cost(plan: &Plan, group: &Group, shape: Shape, choice: &BrickChoice) -> f64 {
     };
     // Cells, chunks and cached pages stay warm in bricks of a few million voxels (the same runs: 77 ms of kernel in bricks of
     // 2 million, 85 of 4, 95 of 8); beyond, the pipeline only gets coarser.
-    let voxels = (0..3).map(|a| shape[a].min(region[a])).product::<usize>() as f64;
+    let voxels = tasks::held(shape, region) as f64;
     let large = 1.0 + voxels / 40e6 + (voxels / 16e6).powi(2) * 0.1;
     let partial_chunks =
         if (0..3).any(|a| !shape[a].is_multiple_of(group.chunk[a]) && shape[a] < region[a]) { 1.15 } else { 1.0 };
@@ -260,7 +258,8 @@ fn one_brick(plan: &Plan, group: &Group, shape: Shape) -> [u64; 2] {
     let bytes = brick_bytes(plan, group, shape) + memory::scratch_bytes(plan, group, shape);
     let mut probe = group.clone();
     probe.brick.shape = shape;
-    [bytes, bytes + parked_bytes(plan, &probe) + memory::FIXED + memory::PER_THREAD * plan.workers as u64]
+    let parked = parked_bytes(plan, &probe) + facts::SLOTS * slot_bytes(plan, &probe);
+    [bytes, bytes + parked + memory::FIXED + memory::PER_THREAD * plan.workers as u64]
 }
 
 /// The least budget that would do for a group.

@@ -5,7 +5,7 @@ use super::tasks::{Group, input_halo};
 use super::{OutputPlan, Plan, flows};
 use crate::config::WhereRule;
 use crate::gpu::flow::Flow;
-use crate::gpu::{facts, passes, record, slopes, sweep, taps};
+use crate::gpu::{passes, record, slopes, sweep, taps};
 use crate::grid::{Border, DType, Region, Shape};
 use crate::kernel::{gaussian, gradient, levels, mask, moments4, rank, reduce, window};
 
@@ -292,10 +292,9 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
     written + encoded + cells + map
 }
 
-/// Open chunks of the levels between their first and last brick, for one task, all outputs, and those that are being encoded; and
-/// the least slots of the GPU lane.
+/// Open chunks of the levels between their first and last brick, for one task, all outputs, and those that are being encoded.
 pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
-    let (mut total, mut encoding) = (facts::SLOTS * slot_bytes(plan, group), 0);
+    let (mut total, mut encoding) = (0, 0);
     for &o in &group.outputs {
         let output = &plan.outputs[o];
         if !output.is_zarr() {

@@ -269,7 +269,7 @@ fn choose_task(outputs: &[&OutputPlan], base: Shape, region: Shape, halo: usize)
     let allowed = |edge: usize| edge == TASK_EDGES[0] || edge >= HALOS_PER_EDGE * halo;
     let shapes = TASK_EDGES.into_iter().filter(|&e| allowed(e)).map(|edge| task_shape(outputs, base, edge));
     let whole: usize = region.iter().product();
-    let most = |task: &Shape| (0..3).map(|a| task[a].min(region[a])).product::<usize>();
+    let most = |task: &Shape| held(*task, region);
     let least = shapes.clone().next_back().filter(|task| most(task) * 4 <= whole * 3);
     let task = shapes
         .clone()
@@ -280,16 +280,20 @@ fn choose_task(outputs: &[&OutputPlan], base: Shape, region: Shape, halo: usize)
     lengthened(task, region)
 }
 
+/// Voxels of a region that a box of this shape holds at most.
+pub fn held(shape: Shape, region: Shape) -> usize {
+    (0..3).map(|a| shape[a].min(region[a])).product()
+}
+
 /// Twice as long along its shortest axis that can grow, as often as it stays one in [`LEAST_TASKS`] of the voxels and no more than
 /// a cube of the first of [`TASK_EDGES`]: of volumes that are thin along some axis, a cube holds little.
 fn lengthened(mut task: Shape, region: Shape) -> Shape {
-    let voxels = |s: Shape| (0..3).map(|a| s[a].min(region[a])).fold(1usize, usize::saturating_mul);
     let most = (region.iter().product::<usize>() / LEAST_TASKS).min(TASK_EDGES[0].pow(3));
     loop {
         let Some(axis) = (0..3).rev().filter(|&a| task[a] < region[a]).min_by_key(|&a| task[a]) else { return task };
         let mut next = task;
         next[axis] = next[axis].saturating_mul(2);
-        if voxels(next) > most {
+        if held(next, region) > most {
             return task;
         }
         task = next;
@@ -354,7 +358,7 @@ mod tests {
 
     /// Voxels of the largest task, and how many there are.
     fn sizes(task: Shape, region: Shape) -> (usize, usize) {
-        ((0..3).map(|a| task[a].min(region[a])).product(), (0..3).map(|a| region[a].div_ceil(task[a])).product())
+        (held(task, region), (0..3).map(|a| region[a].div_ceil(task[a])).product())
     }
 
     #[test]

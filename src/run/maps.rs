@@ -56,8 +56,8 @@ pub fn assemble(
         return Ok(());
     }
     // Where nobody stores level 0, it is never there as a whole.
-    let from = usize::from(map.by_blocks(last));
-    let mut moments = if from == 1 { level_1(assembler, output, map, done, boxes[1], &mut cx) } else { base() };
+    let (from, mut moments) =
+        if map.by_blocks(last) { (1, level_1(assembler, output, map, done, boxes[1], &mut cx)) } else { (0, base()) };
     for k in from..=last {
         if k > from {
             let layout = &map.chain.levels;

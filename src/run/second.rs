@@ -6,7 +6,6 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::assemble::{Target, as_bytes};
-use super::cancel::Cancel;
 use crate::Result;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{AnyView, DType, Region, View};
@@ -18,32 +17,29 @@ use crate::kernel::simd::Level;
 use crate::plan::OutputPlan;
 use crate::store::Spill;
 
-/// Finishes all levels of one output. Idempotent: a second phase that was killed or cancelled is simply done again. `made` hears of
-/// the voxels of every chunk, [`voxels`] of them together.
+/// Told of the box of a chunk before it is made.
+type Before<'a> = &'a (dyn Fn(Region) -> Result<()> + Sync);
+
+/// Finishes all levels of one output. Idempotent: a second phase that was killed or cancelled is simply done again. `before` hears
+/// of every chunk, [`voxels`] of them together, and its error stops the phase.
 pub fn finish_levels(
     output: &OutputPlan,
     target: &Target,
     work_dir: &Path,
     pool: &rayon::ThreadPool,
-    cancel: &Cancel,
-    made: &(dyn Fn(usize) + Sync),
+    before: Before,
 ) -> Result<u64> {
-    let one = |region: Region| {
-        cancel.check()?;
-        made(region.voxels());
-        Ok(())
-    };
     pool.install(|| {
         let mut bytes = 0;
         for k in output.first_level()..=output.brick_level() {
             if let Some(spill) = &target.levels[k] {
-                bytes += shared_level(output, target, spill, k, &one)?;
+                bytes += shared_level(output, target, spill, k, before)?;
             }
         }
         let mut fine = None;
         for k in output.brick_level() + 1..output.level_count() {
             let spill = fine.as_ref().or(target.cells.as_ref()).expect("cells were kept for the levels beyond");
-            let (written, next) = coarse_level(output, target, spill, work_dir, k, &one)?;
+            let (written, next) = coarse_level(output, target, spill, work_dir, k, before)?;
             bytes += written;
             fine = Some(next);
         }
@@ -58,9 +54,6 @@ pub fn voxels(output: &OutputPlan, target: &Target) -> usize {
     let coarse = output.brick_level() + 1..output.level_count();
     components(output) * shared.map(of).sum::<usize>() + coarse.map(of).sum::<usize>()
 }
-
-/// Before each chunk: an error stops the phase.
-type Before<'a> = &'a (dyn Fn(Region) -> Result<()> + Sync);
 
 /// Boxes of the chunks of level `k`.
 fn chunks(output: &OutputPlan, k: usize) -> Vec<Region> {

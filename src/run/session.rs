@@ -56,7 +56,7 @@ pub struct Session<'a> {
     pool: Pool,
     metrics: Metrics,
     trace: Trace,
-    /// Folders to remove at the end.
+    /// When progress was told last, in ms.
     last_tick: AtomicU64,
     /// Whose bricks the GPU's slots were made for.
     last_group: AtomicUsize,
@@ -428,10 +428,7 @@ impl<'a> Session<'a> {
 
     /// After each brick: pages of mapped inputs behind the front are let go, the pool is kept small, progress is told.
     fn tick(&self, brick: &BrickChoice, [voxels, of_voxels, bricks, of_bricks]: [u64; 4], phase: &str) {
-        let now = (self.metrics.seconds() * 1e3) as u64;
-        let last = self.last_tick.load(Ordering::Relaxed);
-        let due = now >= last + 100 || bricks == of_bricks;
-        if due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok() {
+        if self.is_due(bricks == of_bricks) {
             self.pool.trim((brick.bytes * brick.in_flight as u64 / 2) as usize);
             for source in &self.sources {
                 source.release(Region::whole(source.info().shape));
@@ -440,15 +437,20 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Before each chunk of the second phase, ten times a second at most.
+    /// Before each chunk of the second phase.
     fn tick_levels(&self, done: u64, all: u64) {
-        let now = (self.metrics.seconds() * 1e3) as u64;
-        let last = self.last_tick.load(Ordering::Relaxed);
-        let due = now >= last + 100;
-        if due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok() {
+        if self.is_due(false) {
             self.metrics.sample_memory();
             self.progress.update(done, all, 0, 0, "levels");
         }
+    }
+
+    /// Whether to tell progress: ten times a second, by one thread, and at the last brick.
+    fn is_due(&self, last_brick: bool) -> bool {
+        let now = (self.metrics.seconds() * 1e3) as u64;
+        let last = self.last_tick.load(Ordering::Relaxed);
+        let due = now >= last + 100 || last_brick;
+        due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
     }
 
     /// The second phase and the attributes; then the outputs are complete.
@@ -458,18 +460,20 @@ impl<'a> Session<'a> {
             return Err(Error::Failed(format!("{open} of {} tasks are not done", self.done.len())));
         }
         let start = Instant::now();
-        let open = || self.plan.outputs.iter().zip(&self.targets).filter_map(|(o, t)| Some((o, t.as_ref()?)));
-        let all = open().map(|(o, t)| second::voxels(o, t)).sum::<usize>() as u64;
+        let unfinished = self.plan.outputs.iter().zip(&self.targets);
+        let all: usize = unfinished.filter_map(|(o, t)| Some(second::voxels(o, t.as_ref()?))).sum();
         let done = AtomicU64::new(0);
         for o in 0..self.plan.outputs.len() {
             let Some(target) = self.targets[o].take() else { continue };
             let output = &self.plan.outputs[o];
             let dir = Sink::work_dir(&output.spec.path);
-            let made = |voxels: usize| {
-                let before = done.fetch_add(voxels as u64, Ordering::Relaxed);
-                self.tick_levels(before, all);
+            let before = |chunk: Region| {
+                self.options.cancel.check()?;
+                let earlier = done.fetch_add(chunk.voxels() as u64, Ordering::Relaxed);
+                self.tick_levels(earlier, all as u64);
+                Ok(())
             };
-            let bytes = second::finish_levels(output, &target, &dir, &self.threads, &self.options.cancel, &made)?;
+            let bytes = second::finish_levels(output, &target, &dir, &self.threads, &before)?;
             self.metrics.bytes_written(bytes);
             let attributes = outputs::attributes(
                 self.config,
