@@ -16,7 +16,7 @@ struct Write {
     row: u32,
     kind: u32,      // what cells hold
     packing: u32,   // log2 of codes per word
-    linear: u32,    // 1: values are mapped; 0: kept
+    linear: u32,    // 1: values are mapped; 2: f32 in [0, 1] are, the product rounded to f32 first; 0: kept
     fill: u32,      // the code of NaN
     threads: u32,
     real: u32,      // 1: f32 is written
@@ -90,9 +90,12 @@ fn code(v: vec2<u32>) -> u32 {
         return p.fill;
     }
     var t = v;
-    if p.linear == 1u {
+    if p.linear != 0u {
         t = product_of(t, p.half);
         t = product_of(quotient_of(sum_of(t, negated(p.lo)), p.width), p.top);
+    }
+    if p.linear == 2u {
+        t = widened(narrowed(t));
     }
     t = select(p.low, t, is_less64(p.low, t));
     t = select(p.high, t, is_less64(t, p.high));

@@ -88,7 +88,7 @@ fn budgets_threads_bricks_and_sources_never_show() {
         &[SMALL[1], "run.threads=1"],
         &[SMALL[2], "run.threads=3", zarr],
         &[SMALL[0], zarr],
-        &[SMALL[1], "run.brick=[32, 48, 40]"],
+        &["run.memory=56MiB", "run.brick=[32, 48, 40]"],
         &[SMALL[2], "run.brick=[64, 16, 96]", zarr],
     ];
     for sets in variants {

@@ -284,6 +284,63 @@ fn the_least_that_is_asked_for_does() {
     }
 }
 
+/// Cells of levels that only the second phase makes are read in pieces: of wide chunks one plane was read at once, on every thread.
+#[test]
+fn wide_chunks_of_coarse_levels_count_in_the_budget() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("config.toml");
+    let text = "[run]\nmemory = '96MiB'\nthreads = 2\n[input.v]\nsynthetic = 'noise'\nshape = [1, 4096, 16384]\nspacing = [1, 64, 1]\n\
+                dtype = 'u8'\n[output.o]\npath = 'o.zarr'\nfrom = 'v'\nchunk = [1, 4096, 1024]\nshard = 'none'\nlevels = 6\n";
+    std::fs::write(&path, text).unwrap();
+    let peak = peak_of_run(&path);
+    println!("peak {} MiB of wide chunks under a budget of 96 MiB", peak / MIB);
+    assert!(peak <= (96 + 40) * MIB, "peak {} MiB", peak / MIB);
+}
+
+/// A brick keeps the mask of every stage until it is written.
+#[test]
+fn masks_count_in_the_budget() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("config.toml");
+    let mut text = String::from(
+        "[run]\nmemory = '96MiB'\nthreads = 2\ndevice = 'cpu'\n[input.v]\nsynthetic = 'noise'\nshape = [128, 256, 256]\ndtype = 'u8'\n",
+    );
+    let names: Vec<String> = (0..40).map(|i| format!("s{i}")).collect();
+    for (i, name) in names.iter().enumerate() {
+        text += &format!(
+            "[stage.{name}]\nop = 'window'\ninput = 'v'\nlow = 50\nhigh = 200\nwhere = {{ input = 'v', min = {} }}\n",
+            50 + i
+        );
+    }
+    text += &format!(
+        "[stage.c]\nop = 'combine'\nop_kind = 'max'\ninputs = {names:?}\n[output.o]\npath = 'o.zarr'\nfrom = 'c'\nlevels = 1\n"
+    );
+    std::fs::write(&path, text).unwrap();
+    let peak = peak_of_run(&path);
+    println!("peak {} MiB of 40 masks under a budget of 96 MiB", peak / MIB);
+    assert!(peak <= (96 + 32) * MIB, "peak {} MiB", peak / MIB);
+}
+
+/// Bricks that are thin across wide rows of chunks leave many of them open.
+#[test]
+fn open_chunks_count_in_the_budget() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("config.toml");
+    let text = "[input.v]\nsynthetic = 'noise'\nshape = [64, 512, 2048]\ndtype = 'u16'\n[stage.s]\nop = 'box'\ninput = 'v'\nradius = 1\n\
+                [output.o]\npath = 'o.zarr'\nfrom = 's.variance'\nlevels = 1\nshard = 'none'\n";
+    let asked = |memory: u64| {
+        let head =
+            format!("run.memory = '{memory}MiB'\nrun.threads = 2\nrun.device = 'cpu'\nrun.brick = [8, 512, 64]\n");
+        std::fs::write(&path, head + text).unwrap();
+    };
+    asked(40);
+    let least = asked_for(&path, "40MiB").expect("64 chunks of a mebibyte do not fit");
+    asked(least + 8);
+    let peak = peak_of_run(&path);
+    println!("peak {} MiB of open chunks under a budget of {} MiB", peak / MIB, least + 8);
+    assert!(peak <= (least + 8 + 32) * MIB, "peak {} MiB", peak / MIB);
+}
+
 /// Chunks as large as a volume, of which only a corner exists; and volumes of one chunk.
 #[test]
 fn large_chunks_count_in_the_budget() {

@@ -72,9 +72,10 @@ fn killed_at_random_moments_it_resumes_to_the_same_bytes() {
     let reference = folder();
     run(reference.path(), CONFIG, &[]);
     let expected = decoded(reference.path());
+    let (mut all_kills, mut resumed) = (0, 0);
     for round in 0..4u64 {
         let dir = folder();
-        let (mut kills, mut resumed) = (0, 0);
+        let mut kills = 0;
         loop {
             let mut child = start(dir.path()).spawn().unwrap();
             // From the first milliseconds to beyond the end; later tries get longer, so that the loop ends.
@@ -93,12 +94,60 @@ fn killed_at_random_moments_it_resumes_to_the_same_bytes() {
         let report: serde_json::Value =
             serde_json::from_slice(&fs::read(dir.path().join("report.json")).unwrap()).unwrap();
         resumed += report["bricks"]["resumed"].as_u64().unwrap();
-        println!("round {round}: {kills} kills, {resumed} bricks found done by the last start");
+        all_kills += kills;
+        println!("round {round}: {kills} kills, {resumed} bricks found done by the last starts");
         for (name, (a, b)) in OUTPUTS.iter().zip(expected.iter().zip(decoded(dir.path()))) {
             assert_same(&format!("{name} after {kills} kills"), a, &b);
         }
+        for name in ["ao.zarr/zarr.json", "ao.zarr/0/zarr.json", "ao.zarr/5/zarr.json", "mean.zarr/zarr.json"] {
+            let [a, b] = [&reference, &dir].map(|d| fs::read_to_string(d.path().join("out").join(name)).unwrap());
+            assert_eq!(a, b, "{name} after {kills} kills");
+        }
         assert!(!dir.path().join("out/ao.zarr.occlude").exists(), "the work folder of a finished output is gone");
     }
+    assert!(all_kills > 0 && resumed > 0, "{all_kills} kills, after which {resumed} bricks were found done");
+}
+
+/// Arrays of the second phase lie in `run.scratch`; a run that goes on finds them there whatever its config says by then.
+#[test]
+fn what_waits_for_the_second_phase_lies_in_scratch() {
+    let reference = folder();
+    run(reference.path(), CONFIG, &[]);
+    let dir = folder();
+    let config = parse(dir.path(), CONFIG, &["run.scratch=\"elsewhere\""]);
+    let options = RunOptions::default();
+    let session =
+        Session::open(&config, &options, &Silent).map_err(|e| e.to_string()).unwrap_or_else(|e| panic!("{e}"));
+    let first = session.open_tasks()[0];
+    session.run_task(first).unwrap();
+    drop(session);
+    let scratch = dir.path().join("elsewhere");
+    let names = |folder: &Path| -> Vec<String> {
+        fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect()
+    };
+    let arrays =
+        |folder: &Path| names(folder).iter().filter(|n| n.starts_with("cells.") || n.starts_with("level.")).count();
+    assert!(names(&scratch).iter().map(|own| arrays(&scratch.join(own))).sum::<usize>() > 0);
+    assert_eq!(arrays(&dir.path().join("out/ao.zarr.occlude")), 0);
+    let report = run_with(&parse(dir.path(), CONFIG, &[]), &RunOptions { resume: true, ..Default::default() });
+    assert!(report.bricks.resumed > 0 && report.read_amplification > 1.0, "{report:?}");
+    assert_eq!(names(&scratch), [""; 0]);
+    for (name, (a, b)) in OUTPUTS.iter().zip(decoded(reference.path()).iter().zip(&decoded(dir.path()))) {
+        assert_same(name, a, b);
+    }
+}
+
+/// The trace of a run that was stopped tells what it did until then.
+#[test]
+fn a_stopped_run_leaves_its_trace() {
+    let dir = folder();
+    let cancel = Cancel::new();
+    let trace = dir.path().join("trace.json");
+    let options = RunOptions { trace: Some(trace.clone()), cancel: cancel.clone(), ..Default::default() };
+    let stopped = occlude::run::run(&parse(dir.path(), CONFIG, &[]), &options, &StopSoon(cancel));
+    assert!(matches!(stopped, Err(occlude::Error::Interrupted)), "{stopped:?}");
+    let spans: serde_json::Value = serde_json::from_slice(&fs::read(trace).unwrap()).unwrap();
+    assert!(!spans["traceEvents"].as_array().unwrap().is_empty());
 }
 
 #[test]

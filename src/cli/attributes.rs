@@ -5,7 +5,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use crate::grid::DType;
-use crate::store::Sink;
+use crate::store::{Orientation, Sink};
 
 /// Larger metadata is not read.
 const MAX_BYTES: u64 = 64 << 20;
@@ -90,6 +90,13 @@ impl Attributes {
         let sizes: [f64; 3] = sizes.try_into().ok()?;
         let unit = occlude.get("units").and_then(Value::as_str).map(String::from);
         sizes.iter().all(|s| s.is_finite() && *s > 0.0).then_some((sizes, unit))
+    }
+
+    /// The input's direction matrix, without its place.
+    pub fn orientation(&self) -> Option<Orientation> {
+        let recorded = self.occlude.as_ref()?.get("orientation")?;
+        let matrix: [[f64; 4]; 3] = serde_json::from_value(recorded.get("matrix_xyz")?.clone()).ok()?;
+        Some(Orientation { matrix, space: recorded.get("space")?.as_str()?.to_string() })
     }
 
     /// `Some(false)`: an output that was not finished.

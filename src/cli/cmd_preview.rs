@@ -22,9 +22,11 @@ struct Slice {
     components: Vec<Vec<f64>>,
     /// Physical height and width of a voxel.
     step: [f64; 2],
+    /// The first row is drawn lowest.
+    flipped: bool,
 }
 
-/// Draws slices.
+/// Draws slices, upright where the file says which way a body lies in it.
 pub fn run(args: &PreviewArgs) -> Result<()> {
     let cancel = messages::interrupts();
     let volume = Volume::open(&args.path, args.level, &args.raw, &cancel)?;
@@ -71,23 +73,30 @@ fn slice(volume: &Volume, axis: usize, index: usize, components: &[usize]) -> Re
     region.lo[axis] = index as i64;
     region.hi[axis] = index as i64 + 1;
     let [row, column] = [[1, 2], [0, 2], [0, 1]][axis];
+    let upward = volume.orientation().and_then(|o| o.upward(row));
+    let up = upward.map_or(String::new(), |(toward, _)| format!(" up={toward}"));
     let values = components.iter().map(|&c| reader::read_box(volume, c, region)).collect::<Result<_>>()?;
     Ok(Slice {
-        label: format!("{}={index}", ["z", "y", "x"][axis]),
+        label: format!("{}={index}{up}", ["z", "y", "x"][axis]),
         rows: info.shape[row],
         columns: info.shape[column],
         components: values,
         step: [info.spacing[row], info.spacing[column]],
+        flipped: upward.is_some_and(|(_, grows)| grows),
     })
 }
 
-/// Least and largest finite value shown; openness is shown whole.
+/// Least and largest finite value shown; openness, and colours from 0 to 1, are shown whole.
 fn range(slices: &[Slice], openness: bool) -> [f64; 2] {
     if openness {
         return [0.0, 1.0];
     }
     let values = slices.iter().flat_map(|s| s.components.iter().flatten()).copied().filter(|v| v.is_finite());
     let ends = values.fold([f64::INFINITY, f64::NEG_INFINITY], |[lo, hi], v| [lo.min(v), hi.max(v)]);
+    let colours = slices.iter().all(|s| s.components.len() == 3);
+    if colours && ends[0] >= 0.0 && ends[1] <= 1.0 {
+        return [0.0, 1.0];
+    }
     if ends[0] <= ends[1] { ends } else { [0.0, 1.0] }
 }
 
@@ -125,7 +134,9 @@ fn draw(slices: &[Slice], range: [f64; 2], map: &ColourMap) -> Canvas {
     let line = GLYPH[1] * 2;
     let ends = range.map(human::number);
     let footer: usize = 12 * ends.iter().map(|e| e.len()).sum::<usize>() + 64 + 4 * GAP;
-    let width = (sizes.iter().map(|s| s[1] + GAP).sum::<usize>() + GAP).max(footer);
+    // A narrow picture is given the room of its label.
+    let across = |slice: &Slice, width: usize| width.max(12 * slice.label.len()) + GAP;
+    let width = (slices.iter().zip(&sizes).map(|(s, size)| across(s, size[1])).sum::<usize>() + GAP).max(footer);
     let tallest = sizes.iter().map(|s| s[0]).max().unwrap_or(1);
     let mut canvas = Canvas::new(width, tallest + 5 * GAP + 2 * line, 24);
     let mut left = GAP;
@@ -134,11 +145,12 @@ fn draw(slices: &[Slice], range: [f64; 2], map: &ColourMap) -> Canvas {
         for (y, x) in (0..*height).flat_map(|y| (0..*width).map(move |x| (y, x))) {
             // The voxel under the middle of the pixel.
             let row = ((2 * y + 1) * slice.rows / (2 * height)).min(slice.rows - 1);
+            let row = if slice.flipped { slice.rows - 1 - row } else { row };
             let column = ((2 * x + 1) * slice.columns / (2 * width)).min(slice.columns - 1);
             let rgb = slice.colour(row * slice.columns + column, range, map);
             canvas.set(left + x, 2 * GAP + line + y, rgb);
         }
-        left += width + GAP;
+        left += across(slice, *width);
     }
     legend(&mut canvas, 3 * GAP + line + tallest, &ends, map);
     canvas
@@ -160,7 +172,7 @@ mod tests {
 
     fn test_slice(rows: usize, columns: usize, step: [f64; 2]) -> Slice {
         let values = (0..rows * columns).map(|i| i as f64).collect();
-        Slice { label: "z=1".into(), rows, columns, components: vec![values], step }
+        Slice { label: "z=1".into(), rows, columns, components: vec![values], step, flipped: false }
     }
 
     #[test]
@@ -176,6 +188,16 @@ mod tests {
     }
 
     #[test]
+    fn a_body_stands_upright() {
+        let mut s = test_slice(2, 1, [1.0, 1.0]);
+        for (flipped, top) in [(false, 0), (true, 255)] {
+            s.flipped = flipped;
+            let canvas = draw(std::slice::from_ref(&s), [0.0, 1.0], &GREY);
+            assert_eq!(canvas.pixels[((2 * GAP + 14) * canvas.width + GAP) * 3], top);
+        }
+    }
+
+    #[test]
     fn ranges_and_pictures_of_odd_values() {
         let mut s = test_slice(1, 3, [1.0, 1.0]);
         s.components[0] = vec![f64::NAN, f64::INFINITY, 2.0];
@@ -185,6 +207,8 @@ mod tests {
         assert_eq!(s.colour(3, [0.0, 3.0], &GREY), [255; 3]);
         s.components = vec![vec![0.0; 4], vec![0.5; 4], vec![1.0; 4]];
         assert_eq!(s.colour(0, [0.0, 1.0], &GREY), [0, 128, 255]);
+        let pale = Slice { components: vec![vec![0.25; 4], vec![0.5; 4], vec![0.75; 4]], ..test_slice(2, 2, [1.0; 2]) };
+        assert_eq!(range(&[pale], false), [0.0, 1.0]);
         let canvas = draw(&[s], [0.0, 1.0], &VIRIDIS);
         assert_eq!(canvas.pixels.len(), canvas.width * canvas.height * 3);
         let lit = |x: usize, y: usize| canvas.pixels[(y * canvas.width + x) * 3 + 2];

@@ -32,7 +32,7 @@ use args::{Cli, Command, ConfigArgs, DeviceArg};
 /// config, 130 interrupted).
 pub fn main() -> ExitCode {
     process::set_up();
-    messages::hook_panics(std::env::args_os().any(|a| a == "-v" || a == "--verbose"));
+    messages::hook_panics(std::env::args_os().any(|a| a == "-v" || a == "-vv" || a == "--verbose"));
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {

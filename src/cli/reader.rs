@@ -4,7 +4,6 @@
 //! as decoded, in its stored type; so nothing is decoded twice, and memory is one such row.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use rayon::prelude::*;
 
@@ -17,7 +16,7 @@ use crate::config::{Input, InputKind, Place, RawFormat, Select};
 use crate::grid::{Affine, DType, Region, Shape, Voxel};
 use crate::run::Cancel;
 use crate::store::source::ChunkRead;
-use crate::store::{Source, VolumeInfo};
+use crate::store::{Orientation, Source, VolumeInfo};
 use crate::{Error, Result, with_voxels};
 
 /// More voxels than this are not held at once.
@@ -30,27 +29,6 @@ pub struct Volume {
     pub attributes: Attributes,
     /// Stored to scaled values: the recorded value range where there is one, else the file's slope and intercept.
     pub affine: Affine,
-    /// Dropped last: folders with unpacked data.
-    _scratch: Option<Scratch>,
-}
-
-/// A folder that goes away with its owner.
-struct Scratch(PathBuf);
-
-impl Scratch {
-    fn new() -> Result<Scratch> {
-        static COUNT: AtomicU64 = AtomicU64::new(0);
-        let name = format!("occlude-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let path = std::env::temp_dir().join(name);
-        std::fs::create_dir(&path).map_err(|e| Error::file(&path, format!("cannot make a folder for scratch: {e}")))?;
-        Ok(Scratch(path))
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
 }
 
 /// The input that a path on the command line means: all channels, first time step.
@@ -92,7 +70,7 @@ fn of_flag(path: &Path, error: Error) -> Error {
 }
 
 impl Volume {
-    /// Opens a volume and makes its voxels readable (gzip is unpacked into a temporary folder).
+    /// Opens a volume and makes its voxels readable (gzip is unpacked into a nameless file of the temporary folder).
     pub fn open(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
         let volume = Volume::open_level(path, level, raw, cancel)?;
         if volume.attributes.complete() == Some(false) {
@@ -112,27 +90,30 @@ impl Volume {
         let mut source = Source::open(given)?;
         source.prepare(folder, &|_| !cancel.is_cancelled())?;
         cancel.check()?;
-        Ok(Volume::new(path, source, Attributes::default(), None))
+        Ok(Volume::new(path, source, Attributes::default()))
     }
 
     fn open_level(path: &Path, level: usize, raw: &RawArgs, cancel: &Cancel) -> Result<Volume> {
         let attributes = attributes::read(path);
         let mut source = Source::open(&described(path, level, raw, &attributes)?).map_err(|e| of_flag(path, e))?;
-        let scratch = if source.spool_bytes() > 0 { Some(Scratch::new()?) } else { None };
-        let folder = scratch.as_ref().map_or_else(std::env::temp_dir, |s| s.0.clone());
-        source.prepare(&folder, &|_| !cancel.is_cancelled())?;
+        source.prepare(&std::env::temp_dir(), &|_| !cancel.is_cancelled())?;
         cancel.check()?;
-        Ok(Volume::new(path, source, attributes, scratch))
+        Ok(Volume::new(path, source, attributes))
     }
 
-    fn new(path: &Path, source: Source, attributes: Attributes, scratch: Option<Scratch>) -> Volume {
+    fn new(path: &Path, source: Source, attributes: Attributes) -> Volume {
         let info = source.info();
         let affine = recorded(info.dtype, &attributes).unwrap_or(info.affine);
-        Volume { path: path.to_path_buf(), source, attributes, affine, _scratch: scratch }
+        Volume { path: path.to_path_buf(), source, attributes, affine }
     }
 
     pub fn info(&self) -> &VolumeInfo {
         self.source.info()
+    }
+
+    /// Of the file, or what an output recorded of its input's.
+    pub fn orientation(&self) -> Option<Orientation> {
+        self.info().orientation.clone().or_else(|| self.attributes.orientation())
     }
 
     pub fn planes(&self, component: usize) -> Result<Planes<'_>> {

@@ -210,7 +210,7 @@ impl Codes {
             start,
             kind: self.kind,
             packing: [0, 2, 1, 0, 0][size],
-            linear: self.mapping.range.is_some() as u32,
+            linear: self.mapping.range.is_some() as u32 + (self.mapping.is_unit() && !cells) as u32,
             fill: fill.round_ties_even() as i64 as u32,
             threads,
             real: (self.dtype == DType::F32) as u32,

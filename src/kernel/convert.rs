@@ -8,7 +8,7 @@ use crate::with_view;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mapping {
     /// Integer outputs: values `lo` and `hi` map to 0 and the type's maximum (computed in f64, round half even,
-    /// saturating between the two); `None` keeps values (round half even, saturating to the type). Float outputs always
+    /// saturating between the two; of single floats in [0, 1] as [`unit_code`] says); `None` keeps values (round half even, saturating to the type). Float outputs always
     /// keep values.
     pub range: Option<[f64; 2]>,
     /// Integer outputs: the stored code that NaN becomes.
@@ -18,6 +18,11 @@ pub struct Mapping {
 impl Mapping {
     /// Values as they are.
     pub const KEEP: Mapping = Mapping { range: None, fill: 0.0 };
+
+    /// Whether it is that of openness.
+    pub fn is_unit(&self) -> bool {
+        self.range == Some([0.0, 1.0])
+    }
 }
 
 /// Converts voxel by voxel on the best instruction set of this CPU. Panics if the shapes differ.
@@ -31,13 +36,13 @@ pub fn convert_at(level: Level, src: AnyView, mapping: Mapping, mut dst: AnyView
     let [nz, ny, _] = src.shape();
     let rows = (0..nz).flat_map(|z| (0..ny).map(move |y| (z, y)));
     let fill = |dtype| Linear::new(mapping, dtype).fill;
-    let fused = level > Level::Baseline && mapping.range == Some([0.0, 1.0]);
+    let in_unit = mapping.is_unit();
     match (src, &mut dst) {
-        (AnyView::F32(s), AnyViewMut::U8(d)) if fused => {
+        (AnyView::F32(s), AnyViewMut::U8(d)) if in_unit => {
             let fill = fill(DType::U8);
             rows.for_each(|(z, y)| unit(level, s.row_at(z, y), 255.0, fill, d.row_at(z, y)));
         }
-        (AnyView::F32(s), AnyViewMut::U16(d)) if fused => {
+        (AnyView::F32(s), AnyViewMut::U16(d)) if in_unit => {
             let fill = fill(DType::U16);
             rows.for_each(|(z, y)| unit(level, s.row_at(z, y), 65535.0, fill, d.row_at(z, y)));
         }
@@ -49,7 +54,7 @@ pub fn convert_at(level: Level, src: AnyView, mapping: Mapping, mut dst: AnyView
     }
 }
 
-/// Converts one row. Panics if the lengths differ.
+/// Converts one row, single floats in [0, 1] excepted. Panics if the lengths differ.
 pub fn convert_row<S: Voxel, D: Output>(level: Level, src: &[S], mapping: Mapping, dst: &mut [D]) {
     assert_eq!(src.len(), dst.len());
     if D::DTYPE.is_float() || (S::DTYPE == D::DTYPE && mapping.range.is_none()) {
@@ -139,11 +144,12 @@ fn quantise_loop<S: Voxel, D: Output>(src: &[S], map: Linear, dst: &mut [D]) {
     }
 }
 
-/// Round half even of `top o` for `o` in [0, 1] and integers of up to 16 bits: a fused product and 2^23 round once, and leave the
-/// integer in the low bits. So single floats of openness need no f64 on the way.
+/// Round half even of `top o` for `o` in [0, 1] and integers of up to 16 bits: 2^23 leaves the integer in the low bits, and single
+/// floats of openness need no f64 on the way. The product is rounded to f32 before: a share that lies half way between two codes,
+/// as 1/6 of 255, is seldom an f32, but the product of the nearest one is the half again, and goes to the even code.
 #[inline(always)]
 pub fn unit_code(o: f32, top: f32) -> u32 {
-    o.mul_add(top, 8_388_608.0).to_bits() & 0xffff
+    (o * top + 8_388_608.0).to_bits() & 0xffff
 }
 
 #[inline(always)]
@@ -168,16 +174,16 @@ crate::multiversion! {
     fn quantise[S: Voxel, D: Output](src: &[S], map: Linear, dst: &mut [D]) -> () = quantise_inner;
 }
 crate::multiversion! {
-    /// [`quantise`] of [0, 1] to integers of up to 16 bits, of which `top` is the largest. Without fused operations it is the slower one.
+    /// [`quantise`] of single floats in [0, 1] to integers of up to 16 bits, of which `top` is the largest.
     fn unit[D: Output](src: &[f32], top: f32, fill: f64, dst: &mut [D]) -> () = unit_inner;
 }
 crate::multiversion! {
     fn cast[S: Voxel, D: Output](src: &[S], dst: &mut [D]) -> () = cast_inner;
 }
 
-/// One value by the words of [`Mapping`], for checking [`convert`].
+/// One value by the words of [`Mapping`], for checking [`convert`]; `single`: it was an f32.
 #[cfg(test)]
-fn reference<D: Voxel>(v: f64, mapping: Mapping) -> D {
+fn reference<D: Voxel>(v: f64, single: bool, mapping: Mapping) -> D {
     if D::DTYPE.is_float() {
         return D::from_f64(v);
     }
@@ -188,6 +194,9 @@ fn reference<D: Voxel>(v: f64, mapping: Mapping) -> D {
         None => D::from_f64(v),
         Some([lo, hi]) => {
             let max = D::DTYPE.range().1;
+            if single && mapping.is_unit() && max <= 65535.0 {
+                return D::from_f64((v.clamp(0.0, 1.0) as f32 * max as f32) as f64);
+            }
             D::from_f64(((v - lo) / (hi - lo) * max).clamp(0.0, max))
         }
     }
@@ -234,7 +243,7 @@ mod tests {
                         convert_at(level, src.view(shape), mapping, dst.view_mut(shape));
                         let mut want = Voxels::zeroed(to, n);
                         crate::with_voxels!(&mut want, w => for (i, w) in w.iter_mut().enumerate() {
-                            *w = reference(src.at(i), mapping);
+                            *w = reference(src.at(i), from == DType::F32, mapping);
                         });
                         assert_eq!(dst.as_bytes(), want.as_bytes(), "{from} -> {to}, {mapping:?}, {level:?}");
                     }
@@ -243,27 +252,29 @@ mod tests {
         }
     }
 
+    fn codes_of(values: &[f32], dtype: DType) -> Vec<u32> {
+        let (shape, unit) = ([1, 1, values.len()], Mapping { range: Some([0.0, 1.0]), fill: 0.0 });
+        let mut codes = Voxels::zeroed(dtype, values.len());
+        convert(AnyView::F32(View::dense(values, shape)), unit, codes.view_mut(shape));
+        (0..values.len()).map(|i| codes.at(i) as u32).collect()
+    }
+
+    /// The f32 next to every half code goes to the even code, and its neighbours, which the half is not, to their own.
     #[test]
-    fn openness_rounds_half_to_even_of_the_exact_product() {
-        // Around every half code of u16: O * 65535 is exact in f64 for f32 openness.
-        let mut values = Vec::new();
-        for code in 0..65535u32 {
-            let half = ((code as f64 + 0.5) / 65535.0) as f32;
-            values.extend([half, f32::from_bits(half.to_bits() + 1), f32::from_bits(half.to_bits() - 1)]);
+    fn openness_half_way_between_two_codes_goes_to_the_even_one() {
+        for (dtype, top) in [(DType::U8, 255u32), (DType::U16, 65535)] {
+            let half = |code: u32| ((code as f64 + 0.5) / top as f64) as f32;
+            let next = |v: f32, by: i32| f32::from_bits(v.to_bits().wrapping_add_signed(by));
+            let values: Vec<f32> = (0..top).flat_map(|c| [half(c), next(half(c), 2), next(half(c), -2)]).collect();
+            let codes = codes_of(&values, dtype);
+            for (code, three) in (0..top).zip(codes.as_chunks::<3>().0) {
+                assert_eq!(*three, [code + code % 2, code + 1, code], "{code} and a half of {top}");
+            }
         }
-        values.extend([0.5, 1.0, 0.0]);
-        let mut codes = vec![0u16; values.len()];
-        let shape = [1, 1, values.len()];
-        let unit = Mapping { range: Some([0.0, 1.0]), fill: 0.0 };
-        convert(AnyView::F32(View::dense(&values, shape)), unit, AnyViewMut::U16(ViewMut::dense(&mut codes, shape)));
-        for (v, c) in values.iter().zip(&codes) {
-            assert_eq!(*c as f64, (*v as f64 * 65535.0).round_ties_even(), "{v}");
-        }
-        let mut ties = [0u8; 2];
-        let half = [0.5f32 / 255.0 * 255.0, 0.5];
-        let shape = [1, 1, 2];
-        convert(AnyView::F32(View::dense(&half, shape)), unit, AnyViewMut::U8(ViewMut::dense(&mut ties, shape)));
-        assert_eq!(ties, [128, 128], "127.5 rounds to the even 128");
+        // Shares of windows with an even number of voxels.
+        let shares = [[1.0, 6.0], [3.0, 10.0], [33.0, 34.0], [1.0, 2.0], [1.0, 1.0], [0.0, 9.0]];
+        let shares = shares.map(|[k, n]: [f64; 2]| (k / n) as f32);
+        assert_eq!(codes_of(&shares, DType::U8), [42, 76, 248, 128, 255, 0]);
     }
 
     #[test]

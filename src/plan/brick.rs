@@ -2,7 +2,8 @@
 
 use super::Plan;
 use super::graph::Producer;
-use super::memory::{self, brick_bytes, parked_bytes, slot_bytes};
+use super::memory::{self, brick_bytes, slot_bytes};
+use super::parked::parked_bytes;
 use super::tasks::{Group, input_halo};
 use super::{streams, tasks};
 use crate::config::Config;
@@ -214,17 +215,26 @@ fn amplification(plan: &Plan, group: &Group, shape: Shape) -> f64 {
     let inputs = &group.inputs;
     let one = |w: usize| {
         let halo = input_halo(plan, group, w);
-        (0..3)
-            .map(|a| {
-                let b = shape[a].min(group.region.shape()[a]) as f64;
-                (b + 2.0 * halo[a] as f64).min(group.shape[a] as f64) / b
-            })
-            .product::<f64>()
+        (0..3).map(|a| seen_along(group, shape[a], halo[a], a)).product::<f64>()
     };
     let mean = inputs.iter().map(|&w| one(w)).sum::<f64>() / inputs.len().max(1) as f64;
     let streamed = group.steps.iter().filter(|&&s| plan.graph.steps[s].streamed.is_some());
     let fetched: usize = streamed.map(|&s| streams::fetched(plan, s, shape, group.shape)).sum();
     mean + fetched as f64 / shape.iter().product::<usize>() as f64
+}
+
+/// Voxels that bricks of this edge see along an axis, halos included, per voxel that they make.
+fn seen_along(group: &Group, edge: usize, halo: usize, axis: usize) -> f64 {
+    let (lo, hi, n) = (group.region.lo[axis] as usize, group.region.hi[axis] as usize, group.shape[axis]);
+    let (mut at, mut seen) = (lo, 0);
+    while at < hi {
+        // Bricks end where tasks do.
+        let task_end = lo + ((at - lo) / group.task[axis] + 1) * group.task[axis];
+        let end = (at + edge).min(task_end).min(hi);
+        seen += (end + halo).min(n) - at.saturating_sub(halo);
+        at = end;
+    }
+    seen as f64 / (hi - lo).max(1) as f64
 }
 
 /// Relative time per voxel: work on halos, short rows, idle cores at the end, too few bricks in flight.

@@ -52,8 +52,22 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
             |w: WireId| group.outputs.iter().any(|&o| plan.outputs[o].map.as_ref().is_some_and(|m| m.source == w));
         live.retain(|(w, _)| last_use(*w) || is_map(*w));
     }
+    let masks = mask_bytes(plan, group, shape);
     let sinks: u64 = group.outputs.iter().map(|&o| output_bytes(plan, group, &plan.outputs[o], shape)).sum();
-    peak.max(sum(&live) + sinks)
+    masks + peak.max(sum(&live) + sinks)
+}
+
+/// Masks that a brick keeps until it is written: steps that have the same share it.
+fn mask_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
+    let mut distinct: Vec<(&Mask, [usize; 3])> = Vec::new();
+    for step in group.steps.iter().map(|&s| &plan.graph.steps[s]) {
+        if let Some(mask) = &step.mask
+            && !distinct.contains(&(mask, step.halo))
+        {
+            distinct.push((mask, step.halo));
+        }
+    }
+    distinct.iter().map(|(_, halo)| grown(shape, *halo, group.shape).iter().map(|&n| n as u64).product::<u64>()).sum()
 }
 
 /// Bytes that a worker needs besides to compute bricks of `shape`: bricks that wait to be computed or written take none.
@@ -134,7 +148,7 @@ fn step_scratch(plan: &Plan, step: &Step, brick: Shape, volume: Shape) -> u64 {
     (kernel + copy + masked(step, dst)) as u64
 }
 
-/// The mask of a step, and what a kernel that skips keeps of it.
+/// The part of a mask that levels see, and what a kernel that skips keeps of it.
 fn masked(step: &Step, dst: Shape) -> usize {
     let kernel = match &step.kind {
         StepKind::Obscurance { sweep, .. } => sweep.masked_bytes(dst),
@@ -290,56 +304,6 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
         None => 0,
     };
     written + encoded + cells + map
-}
-
-/// Open chunks of the levels between their first and last brick, for one task, all outputs, and those that are being encoded.
-pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
-    let (mut total, mut encoding) = (0, 0);
-    for &o in &group.outputs {
-        let output = &plan.outputs[o];
-        if !output.is_zarr() {
-            continue;
-        }
-        let parts = output.spec.components.unwrap_or(1) as u64;
-        let voxel = output.spec.dtype.size() as u64;
-        let task: Shape = std::array::from_fn(|a| group.task[a].min(group.region.shape()[a]));
-        for k in 0..=output.brick_level() {
-            let factor = output.level(k).expect("level exists").factor;
-            // Chunks are whole in memory where the volume ends inside them.
-            let along = |a: usize| task[a].div_ceil(factor[a]).div_ceil(output.spec.chunk[a]) as u64;
-            let chunks = (0..3).map(along).product::<u64>();
-            // Along the Morton curve, at most the chunks along a brick's longest row wait at once, and about as many again.
-            let chunk = output.spec.chunk.iter().map(|&n| n as u64).product::<u64>() * voxel * parts;
-            let row = group.brick.shape[2].div_ceil(output.spec.chunk[2]) as u64;
-            let whole = k == 0 && (0..3).all(|a| group.brick.shape[a].is_multiple_of(output.spec.chunk[a]));
-            total += if whole { 0 } else { chunks.min(8 * row.max(1)) * chunk };
-            // Each worker encodes one at a time: as its filters leave it, and as it is compressed.
-            encoding = encoding.max(chunks.min(plan.workers as u64) * (2 * chunk).saturating_sub(PER_THREAD));
-        }
-        total += index_bytes(output, task);
-        // Cells kept for the second phase, where there is one.
-        if output.level_count() > output.brick_level() + 1 {
-            let deepest = output.level(output.brick_level()).expect("level exists").factor;
-            let cells =
-                task.iter().map(|&n| n as u64).product::<u64>() / deepest.iter().map(|&f| f as u64).product::<u64>();
-            total += cells * parts * reduce::bytes_per_cell(output.reduce) as u64;
-        }
-    }
-    total + encoding
-}
-
-/// Indices of the shards of all levels of a task, and one of them once more while it is written.
-fn index_bytes(output: &OutputPlan, task: Shape) -> u64 {
-    if !output.spec.is_sharded() {
-        return 0;
-    }
-    let (file, chunk) = (output.spec.file_shape(), output.spec.chunk);
-    let entries = (0..3).map(|a| (file[a] / chunk[a]) as u64).product::<u64>();
-    let shards = (0..output.level_count())
-        .filter_map(|k| output.level(k))
-        .map(|level| (0..3).map(|a| task[a].div_ceil(level.factor[a]).div_ceil(file[a]) as u64).product::<u64>());
-    let open = shards.sum::<u64>() * output.spec.components.unwrap_or(1) as u64;
-    (open + 1).saturating_mul(16 * entries)
 }
 
 /// Bricks that are alive at once: one per worker, one being read, one being written.

@@ -12,6 +12,7 @@ pub mod lengths;
 pub mod lower;
 pub mod memory;
 pub mod outputs;
+pub mod parked;
 pub mod skips;
 pub mod streams;
 pub mod tasks;

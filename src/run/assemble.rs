@@ -2,6 +2,7 @@
 //! last part.
 
 use std::collections::HashMap;
+use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -42,6 +43,8 @@ pub struct Target {
     pub levels: Vec<Option<Spill>>,
     /// Unrounded cells of the last level that bricks make, for the levels beyond.
     pub cells: Option<Spill>,
+    /// The folder of both.
+    pub scratch: PathBuf,
     /// Values that map to 0 and the largest code.
     pub range: Option<[f64; 2]>,
 }

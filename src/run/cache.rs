@@ -193,7 +193,6 @@ fn load(source: &Source, key: Key, pool: &Pool, metrics: &Metrics) -> Result<(Ch
         }
         ChunkRead::Data { stored_bytes } => {
             metrics.bytes_read(stored_bytes);
-            metrics.chunks_decoded(1);
             let bytes = voxels.capacity_bytes() as u64;
             pool.part_with(&voxels);
             Ok((Chunk::Decoded(Arc::new(voxels)), bytes))

@@ -15,7 +15,6 @@ pub struct Metrics {
     bytes_read: AtomicU64,
     bytes_written: AtomicU64,
     voxels_gathered: AtomicU64,
-    chunks_decoded: AtomicU64,
     bricks_done: AtomicU64,
     voxels_done: AtomicU64,
     bricks_computed: AtomicU64,
@@ -100,7 +99,6 @@ impl Metrics {
             bytes_read: AtomicU64::default(),
             bytes_written: AtomicU64::default(),
             voxels_gathered: AtomicU64::default(),
-            chunks_decoded: AtomicU64::default(),
             bricks_done: AtomicU64::default(),
             voxels_done: AtomicU64::default(),
             bricks_computed: AtomicU64::default(),
@@ -132,10 +130,6 @@ impl Metrics {
 
     pub fn gathered(&self, voxels: u64) {
         self.voxels_gathered.fetch_add(voxels, Relaxed);
-    }
-
-    pub fn chunks_decoded(&self, n: u64) {
-        self.chunks_decoded.fetch_add(n, Relaxed);
     }
 
     pub fn brick_done(&self, voxels: u64) {
@@ -229,6 +223,7 @@ impl Metrics {
     /// Takes in what a pre-pass counted, except its bricks.
     pub fn absorb(&self, other: &Metrics) {
         self.bytes_read(other.bytes_read.load(Relaxed));
+        self.gathered(other.voxels_gathered.load(Relaxed));
         self.read_ns.fetch_add(other.read_ns.load(Relaxed), Relaxed);
         self.peak.fetch_max(other.peak.load(Relaxed), Relaxed);
         for (mine, theirs) in self.steps.iter().zip(&other.steps) {
@@ -264,8 +259,8 @@ impl Metrics {
         report.bytes_read = self.bytes_read.load(Relaxed);
         report.bytes_written = self.bytes_written.load(Relaxed);
         report.peak_memory_bytes = self.peak.load(Relaxed);
-        let done = self.voxels_done.load(Relaxed).max(1);
-        report.read_amplification = self.voxels_gathered.load(Relaxed) as f64 / done as f64;
+        let own = self.voxels_done.load(Relaxed).saturating_sub(self.voxels_resumed.load(Relaxed)).max(1);
+        report.read_amplification = self.voxels_gathered.load(Relaxed) as f64 / own as f64;
         let waits = self.waits.lock().unwrap_or_else(|e| e.into_inner());
         report.waits = waits.iter().map(|(k, v)| (k.to_string(), *v)).collect();
         report.waits.insert("read_busy".into(), self.read_ns.load(Relaxed) as f64 * 1e-9);

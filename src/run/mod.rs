@@ -50,7 +50,11 @@ pub fn run(config: &Config, options: &RunOptions, progress: &dyn Progress) -> Re
     let session = Session::open(config, options, progress)?;
     let tasks = session.open_tasks();
     tracing::info!(open = tasks.len(), of = session.task_count(), "tasks");
-    session.run_tasks(&tasks)?;
+    if let Err(error) = session.run_tasks(&tasks) {
+        // When a trace is wanted most; what ended the run is the error to tell.
+        let _ = session.write_trace();
+        return Err(error);
+    }
     session.finish()
 }
 

@@ -1,6 +1,6 @@
 //! Opening, continuing and finishing outputs, and what they say about themselves.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
@@ -10,7 +10,7 @@ use crate::config::{Config, Output, provenance, stage_constants, stage_parameter
 use crate::grid::Region;
 use crate::kernel::reduce::planes;
 use crate::plan::{Group, OutputPlan, Plan};
-use crate::store::sink::{Claim, Existing, Sink, existing, remove_ours};
+use crate::store::sink::{Claim, Existing, Sink, existing, remove_ours, waiting};
 use crate::store::{Spill, VolumeInfo, os};
 use crate::{Error, Result};
 
@@ -199,6 +199,7 @@ pub fn open_target(
     group: &Group,
     o: usize,
     globals: &[Vec<f64>],
+    scratch: Option<&Path>,
     resume: bool,
     begun: bool,
 ) -> Result<Target> {
@@ -209,26 +210,30 @@ pub fn open_target(
         spec.fill = output.missing(0, range);
     }
     let sink = Sink::create(spec, resume)?;
-    let dir = Sink::work_dir(&output.spec.path);
+    let deepest = output.brick_level();
+    let shared = |k: usize| output.is_zarr() && k >= output.first_level() && !output.owned(k, group);
+    let two_phases = output.level_count() - 1 > deepest || (0..=deepest).any(shared);
+    let dir = match two_phases {
+        true => waiting::folder(&output.spec.path, scratch, begun)?,
+        false => Sink::work_dir(&output.spec.path),
+    };
     let parts = output.spec.components.unwrap_or(1);
     let mut levels = Vec::new();
     let open = |name: String, shape, planes, item| {
         let path = dir.join(name);
         if begun { Spill::reopen(&path, shape, planes, item) } else { Spill::open(&path, shape, planes, item) }
     };
-    for k in 0..=output.brick_level() {
-        let shared = output.is_zarr() && k >= output.first_level() && !output.owned(k, group);
+    for k in 0..=deepest {
         let shape = output.level(k).expect("level exists").shape;
         let level = || open(format!("level.{k}"), shape, parts, output.spec.dtype.size());
-        levels.push(shared.then(level).transpose()?);
+        levels.push(shared(k).then(level).transpose()?);
     }
-    let deepest = output.brick_level();
     let cells = (output.level_count() - 1 > deepest).then(|| {
         let per_cell = if output.map.is_some() { 2 } else { parts * planes(output.reduce) };
         let shape = output.level(deepest).expect("level exists").shape;
         open(format!("cells.{deepest}"), shape, per_cell, size_of::<f64>())
     });
-    Ok(Target { sink, levels, cells: cells.transpose()?, range })
+    Ok(Target { sink, levels, cells: cells.transpose()?, scratch: dir, range })
 }
 
 /// Commits what a finished task left in one output.

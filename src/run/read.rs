@@ -74,6 +74,7 @@ impl Reader<'_> {
                 None => {
                     let wanted = region.grow(mask.reach).clip(&volume);
                     let (mut value, _) = self.input(input, mask.wire, wanted, place, Why::Mask)?;
+                    self.metrics.gathered(wanted.voxels() as u64);
                     let known = self.engine.mask(mask, &mut value, region, volume, scratch);
                     value.recycle(self.engine.pool);
                     known

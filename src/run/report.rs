@@ -19,12 +19,13 @@ pub struct Report {
     /// Bytes read from the inputs' storage.
     pub bytes_read: u64,
     pub bytes_written: u64,
-    /// Voxels gathered for bricks, halos included, per voxel of the region.
+    /// Voxels gathered for bricks, halos included, per voxel that this run made.
     pub read_amplification: f64,
     pub memory_budget_bytes: u64,
     pub peak_memory_bytes: u64,
     pub stages: Vec<StageReport>,
-    /// Seconds that threads waited, by what for (`read`, `write`, `budget`, ...).
+    /// Seconds of all threads together: waiting for bytes of the budget, for a worker or a writer (`budget`, `workers_busy`,
+    /// `writers_busy`), and at work beside the stages (`read_busy`, `encode_busy`).
     pub waits: BTreeMap<String, f64>,
     /// Stage to device (`cpu`, `gpu`).
     pub placement: BTreeMap<String, String>,

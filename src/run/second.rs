@@ -1,8 +1,6 @@
 //! The second phase: levels whose files several tasks share, and levels coarser than bricks make. Everything is read from
 //! scratch, chunk by chunk, so memory does not grow with the volume.
 
-use std::path::Path;
-
 use rayon::prelude::*;
 
 use super::assemble::{Target, as_bytes};
@@ -20,26 +18,25 @@ use crate::store::Spill;
 /// Told of the box of a chunk before it is made.
 type Before<'a> = &'a (dyn Fn(Region) -> Result<()> + Sync);
 
-/// Finishes all levels of one output. Idempotent: a second phase that was killed or cancelled is simply done again. `before` hears
-/// of every chunk, [`voxels`] of them together, and its error stops the phase.
+/// Finishes all levels of one output, so many chunks at a time. Idempotent: a second phase that was killed or cancelled is simply
+/// done again. `before` hears of every chunk, [`voxels`] of them together, and its error stops the phase.
 pub fn finish_levels(
     output: &OutputPlan,
     target: &Target,
-    work_dir: &Path,
-    pool: &rayon::ThreadPool,
+    (pool, lanes): (&rayon::ThreadPool, usize),
     before: Before,
 ) -> Result<u64> {
     pool.install(|| {
         let mut bytes = 0;
         for k in output.first_level()..=output.brick_level() {
             if let Some(spill) = &target.levels[k] {
-                bytes += shared_level(output, target, spill, k, before)?;
+                bytes += shared_level(output, target, spill, k, lanes, before)?;
             }
         }
         let mut fine = None;
         for k in output.brick_level() + 1..output.level_count() {
             let spill = fine.as_ref().or(target.cells.as_ref()).expect("cells were kept for the levels beyond");
-            let (written, next) = coarse_level(output, target, spill, work_dir, k, before)?;
+            let (written, next) = coarse_level(output, target, spill, (k, lanes), before)?;
             bytes += written;
             fine = Some(next);
         }
@@ -67,9 +64,16 @@ fn components(output: &OutputPlan) -> usize {
 }
 
 /// Encodes a level whose rounded voxels tasks left in scratch.
-fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize, before: Before) -> Result<u64> {
+fn shared_level(
+    output: &OutputPlan,
+    target: &Target,
+    spill: &Spill,
+    k: usize,
+    lanes: usize,
+    before: Before,
+) -> Result<u64> {
     let dataset = k - output.first_level();
-    let one = |(component, region): (usize, Region)| {
+    let one = |&(component, region): &(usize, Region)| {
         before(region)?;
         let mut voxels = Voxels::zeroed(output.spec.dtype, region.voxels());
         spill.read(component, region, voxels.as_bytes_mut());
@@ -78,9 +82,15 @@ fn shared_level(output: &OutputPlan, target: &Target, spill: &Spill, k: usize, b
     };
     let all: Vec<(usize, Region)> =
         (0..components(output)).flat_map(|c| chunks(output, k).into_iter().map(move |r| (c, r))).collect();
-    let bytes = all.into_par_iter().map(one).try_reduce(|| 0, |a, b| Ok(a + b))?;
+    let bytes = in_lanes(&all, lanes, one)?;
     target.sink.commit(dataset, Region::whole(output.level(k).expect("level exists").shape))?;
     Ok(bytes)
+}
+
+/// Does so many at a time, each of which holds its chunk; returns the bytes written.
+fn in_lanes<T: Sync>(all: &[T], lanes: usize, one: impl Fn(&T) -> Result<u64> + Sync) -> Result<u64> {
+    let lane = |first: usize| all.iter().skip(first).step_by(lanes).try_fold(0, |bytes, item| Ok(bytes + one(item)?));
+    (0..lanes).into_par_iter().map(lane).try_reduce(|| 0, |a, b| Ok(a + b))
 }
 
 /// Makes level `k` from the cells of level `k - 1`; returns the bytes written and the cells of level `k`.
@@ -88,24 +98,19 @@ fn coarse_level(
     output: &OutputPlan,
     target: &Target,
     fine: &Spill,
-    work_dir: &Path,
-    k: usize,
+    (k, lanes): (usize, usize),
     before: Before,
 ) -> Result<(u64, Spill)> {
     let layout = output.level(k).expect("level exists");
     let per_component = if output.map.is_some() { 2 } else { components(output) * planes(output.reduce) };
-    let next = Spill::open(&work_dir.join(format!("cells.{k}")), layout.shape, per_component, size_of::<f64>())?;
-    let regions = chunks(output, k);
-    let bytes = regions
-        .into_par_iter()
-        .map(|region| {
-            before(region)?;
-            match output.map {
-                Some(_) => map_chunk(output, target, fine, &next, k, region),
-                None => cells_chunk(output, target, fine, &next, k, region),
-            }
-        })
-        .try_reduce(|| 0, |a, b| Ok(a + b))?;
+    let next = Spill::open(&target.scratch.join(format!("cells.{k}")), layout.shape, per_component, size_of::<f64>())?;
+    let bytes = in_lanes(&chunks(output, k), lanes, |&region| {
+        before(region)?;
+        match output.map {
+            Some(_) => map_chunk(output, target, fine, &next, k, region),
+            None => cells_chunk(output, target, fine, &next, k, region),
+        }
+    })?;
     target.sink.commit(k - output.first_level(), Region::whole(layout.shape))?;
     Ok((bytes, next))
 }
@@ -127,8 +132,8 @@ fn read_planes(spill: &Spill, planes: std::ops::Range<usize>, region: Region) ->
     }
 }
 
-/// Cells below that are turned into cells at a time: a chunk has many, and made in one go they leave every cache, on one thread
-/// where a level has one chunk. 2-core Zen 4 VM, AVX-512, 2026-11-27: the end of a pyramid of 1024^3 voxels, of which 64^3 cells from
+/// Cells below that are turned into cells at a time: a chunk has many, and made in one go they leave every cache and, of wide
+/// chunks, the budget, on one thread where a level has one chunk. 2-core Zen 4 VM, AVX-512, 2026-11-27: the end of a pyramid of 1024^3 voxels, of which 64^3 cells from
 /// 128^3 are most, takes 68 ms by slabs and 174 in one go (146 of them for these cells).
 const AT_ONCE: usize = 1 << 15;
 
@@ -141,15 +146,15 @@ fn cells_chunk(
     k: usize,
     region: Region,
 ) -> Result<u64> {
-    let [_, ny, nx] = region.shape();
-    let planes = (AT_ONCE / (8 * ny * nx)).max(1);
+    let slabs = slabs(region, AT_ONCE / 8, 1);
     let mut bytes = 0;
     for component in 0..components(output) {
         let mut rounded = Voxels::zeroed(output.spec.dtype, region.voxels());
-        let slab_bytes = planes * ny * nx * output.spec.dtype.size();
-        let slabs = rounded.as_bytes_mut().par_chunks_mut(slab_bytes).enumerate();
-        slabs.for_each_init(Room::default, |room, (i, dst)| {
-            let slab = slab(region, planes, i);
+        let mut left = rounded.as_bytes_mut();
+        let parts: Vec<(Region, &mut [u8])> = (slabs.iter())
+            .map(|&slab| (slab, left.split_off_mut(..slab.voxels() * output.spec.dtype.size()).expect("slabs fill it")))
+            .collect();
+        parts.into_par_iter().for_each_init(Room::default, |room, (slab, dst)| {
             dst.copy_from_slice(cells_slab(output, target, [fine, next], k, component, slab, room).as_bytes());
         });
         bytes += store(output, target, k, component, region, &rounded)?;
@@ -157,11 +162,17 @@ fn cells_chunk(
     Ok(bytes)
 }
 
-/// The `i`th slab of so many planes of a region.
-fn slab(region: Region, planes: usize, i: usize) -> Region {
-    let lo = region.lo[0] + (i * planes) as i64;
-    let hi = (lo + planes as i64).min(region.hi[0]);
-    Region::new([lo, region.lo[1], region.lo[2]], [hi, region.hi[1], region.hi[2]])
+/// A region cut into whole planes, or rows of one plane, of about so many cells, in memory order; at least `least` planes and
+/// rows, where there are as many.
+fn slabs(region: Region, cells: usize, least: usize) -> Vec<Region> {
+    let [nz, ny, nx] = region.shape();
+    let planes = (cells / (ny * nx)).clamp(least, nz.max(least));
+    let rows = if planes * ny * nx > cells { (cells / (planes * nx)).clamp(least, ny.max(least)) } else { ny };
+    let cut = |a: usize, n: usize| {
+        (region.lo[a]..region.hi[a]).step_by(n).map(move |lo| (lo, (lo + n as i64).min(region.hi[a])))
+    };
+    let slab = |(z, y): ((i64, i64), (i64, i64))| Region::new([z.0, y.0, region.lo[2]], [z.1, y.1, region.hi[2]]);
+    cut(0, planes).flat_map(|z| cut(1, rows).map(move |y| slab((z, y)))).collect()
 }
 
 /// What a thread needs for slabs of cells.
@@ -223,16 +234,13 @@ fn map_chunk(
 ) -> Result<u64> {
     let map = output.map.as_ref().expect("the caller saw a map");
     let (layout, below) = (&map.chain.levels[k], &map.chain.levels[k - 1]);
-    let [_, ny, nx] = region.shape();
-    // Two planes above and below are seen by each slab.
-    let planes = (MAP_CELLS / (ny * nx)).max(4);
     let mut scratch = Scratch::new();
     let mut cx = Context { level: Level::detect(), scratch: &mut scratch };
     let mut made = Moments::default();
     let mut rounded: Vec<Voxels> =
         map.moments.iter().map(|_| Voxels::zeroed(output.spec.dtype, region.voxels())).collect();
-    for i in 0..region.shape()[0].div_ceil(planes) {
-        let slab = slab(region, planes, i);
+    // Two cells on every side are seen by each slab.
+    for slab in slabs(region, MAP_CELLS, 4) {
         let from = needed(slab, layout.halved, below.shape);
         let source = Moments { mean: read_plane(fine, 0, from), variance: read_plane(fine, 1, from) };
         coarsen(&source, from, below.shape, layout.halved, slab, &mut made, &mut cx);

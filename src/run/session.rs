@@ -1,24 +1,23 @@
 //! A run as library calls: open, `run_task(i)` in any order, finish.
 
+mod streaming;
+
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use serde_json::{Value, json};
 
 use super::assemble::{Assembler, Item, Target, TaskSlot};
-use super::cache::{ChunkCache, Uses};
 use super::commits::Commits;
 use super::compute::Finished;
 use super::journal::{self, Journal};
 use super::metrics::Metrics;
 use super::options::{Progress, RunOptions};
 use super::outputs::{self, Start};
-use super::prepass::Finder;
 use super::program::Program;
-use super::read::Reader;
 use super::report::{self, Report};
 use super::steps::Engine;
-use super::stream::{Stream, Work};
+use super::stream::Work;
 use super::trace::Trace;
 use super::unpack::unpack;
 use super::{planned, second, windows};
@@ -26,13 +25,10 @@ use crate::brick::{Pool, Scratch};
 use crate::config::{Config, config_hash};
 use crate::gpu::Gpu;
 use crate::grid::{Region, order::morton};
-use crate::plan::{BrickChoice, Group, Plan, decodes};
-use crate::store::sink::{Claim, Sink};
+use crate::plan::{Group, Plan, decodes, parked};
+use crate::store::sink::Claim;
 use crate::store::{Source, VolumeInfo, changed_by, named_files, open_inputs};
 use crate::{Error, Result};
-
-/// Turns a finished brick into chunks.
-type Deliver<'d> = dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync + 'd;
 
 /// One run, opened.
 pub struct Session<'a> {
@@ -178,11 +174,12 @@ impl<'a> Session<'a> {
         }
         header["globals"] = journal::header("", &[], 0, &Value::Null, &self.globals)["globals"].clone();
         for g in 0..self.plan.groups.len() {
+            let scratch = self.config.run.scratch.as_deref();
             for &o in &self.plan.groups[g].outputs {
                 if !resume || !outputs::is_complete(&self.plan, o, &header) {
                     let group = &self.plan.groups[g];
                     let begun = self.done[group.first_task..][..group.task_count()].iter().any(is_done);
-                    let target = outputs::open_target(&self.plan, group, o, &self.globals, resume, begun)?;
+                    let target = outputs::open_target(&self.plan, group, o, &self.globals, scratch, resume, begun)?;
                     self.targets[o] = Some(target);
                 } else if o + 1 < self.plan.outputs.len() {
                     // The last one's folder holds the journal.
@@ -290,7 +287,10 @@ impl<'a> Session<'a> {
         let commit = |tasks: &[(usize, Region)]| self.commit(group, tasks, only.is_none());
         let write = |work: Work, items: Vec<Item>| {
             let slot = &slots[work.slot];
-            if self.write(slot, items)? { commits.add(slot.number, slot.region, commit) } else { Ok(()) }
+            if self.write(slot, items)? {
+                commits.add(slot.number, slot.region);
+            }
+            commits.settle_due(commit)
         };
         let total: u64 = self.plan.groups.iter().map(|g| g.brick_count() as u64).sum();
         let tick = || {
@@ -345,98 +345,6 @@ impl<'a> Session<'a> {
         failed
     }
 
-    /// What a pre-pass finds over the whole volume.
-    fn prepass(&self, id: usize) -> Result<Vec<f64>> {
-        let prepass = &self.plan.prepasses[id];
-        let lattice = &self.plan.graph.lattices[self.plan.graph.wires[prepass.wires[0]].lattice];
-        let group = self.plan.groups.iter().find(|g| g.shape == lattice.shape).unwrap_or(&self.plan.groups[0]);
-        let brick = group.prepass.as_ref().unwrap_or(&group.brick);
-        let program = Program::of_prepass(&self.plan, prepass, lattice.shape);
-        let engine = self.engine();
-        let whole = Region::whole(lattice.shape);
-        let mut cells: Vec<[i64; 3]> = whole.cells([0; 3], brick.shape).iter().collect();
-        cells.sort_by_key(|c| morton(*c));
-        let bricks = cells.into_iter().map(|c| Region::of_cell(c, [0; 3], brick.shape).clip(&whole));
-        let work: Vec<Work> = bricks.map(|brick| Work { brick, slot: 0 }).collect();
-        let found = Finder::new(&self.plan, prepass, lattice.shape);
-        let deliver = |done: &Finished, _: Work, _: &mut Scratch| {
-            found.add(&self.plan, &prepass.wires, done);
-            Ok(Vec::new())
-        };
-        let metrics = Metrics::new(self.plan.graph.steps.len(), self.plan.flows.len());
-        let tick = || {
-            let (bricks, voxels) = metrics.done();
-            self.tick(
-                brick,
-                [voxels, lattice.shape.iter().product::<usize>() as u64, bricks, work.len() as u64],
-                "pre-pass",
-            );
-        };
-        self.stream(&engine, &program, brick, &work, &metrics, &deliver, &|_, _| Ok(()), &tick)?;
-        self.metrics.absorb(&metrics);
-        Ok(found.result(prepass.kind))
-    }
-
-    #[allow(clippy::too_many_arguments)]
-    fn stream(
-        &self,
-        engine: &Engine,
-        program: &Program,
-        brick: &BrickChoice,
-        work: &[Work],
-        metrics: &Metrics,
-        deliver: &Deliver,
-        write: &(dyn Fn(Work, Vec<Item>) -> Result<()> + Sync),
-        tick: &(dyn Fn() + Sync),
-    ) -> Result<()> {
-        let cache = ChunkCache::new(brick.cache);
-        self.pool.bound((brick.bytes * brick.in_flight as u64 + brick.waiting) as usize);
-        let reader =
-            Reader { engine, program, sources: &self.sources, cache: &cache, uses: self.uses(program, work), metrics };
-        let stream = Stream {
-            reader: &reader,
-            work,
-            brick_bytes: brick.bytes,
-            budget: brick.bytes * brick.in_flight as u64,
-            brick_voxels: brick.shape.iter().map(|&n| n as u64).product(),
-            threads: self.plan.workers,
-            pool: &self.threads,
-            metrics,
-            trace: &self.trace,
-            cancel: &self.options.cancel,
-            deliver,
-            write,
-            tick,
-        };
-        stream.run()
-    }
-
-    /// By which of the work ahead each chunk of each chunked input will be read.
-    fn uses(&self, program: &Program, work: &[Work]) -> Vec<Option<Uses>> {
-        let by_input = |input: usize| {
-            let chunk = self.infos[input].chunk?;
-            let halo = program.inputs.iter().find_map(|&(w, halo)| {
-                (self.plan.graph.wires[w].producer == crate::plan::graph::Producer::Input(input)).then_some(halo)
-            })?;
-            let volume = self.infos[input].shape;
-            let grown: Vec<Region> =
-                work.iter().map(|w| crate::plan::memory::wire_box(w.brick, halo, volume)).collect();
-            Some(Uses::new(&grown, chunk))
-        };
-        (0..self.sources.len()).map(by_input).collect()
-    }
-
-    /// After each brick: pages of mapped inputs behind the front are let go, the pool is kept small, progress is told.
-    fn tick(&self, brick: &BrickChoice, [voxels, of_voxels, bricks, of_bricks]: [u64; 4], phase: &str) {
-        if self.is_due(bricks == of_bricks) {
-            self.pool.trim((brick.bytes * brick.in_flight as u64 / 2) as usize);
-            for source in &self.sources {
-                source.release(Region::whole(source.info().shape));
-            }
-            self.progress.update(voxels, of_voxels, bricks, of_bricks, phase);
-        }
-    }
-
     /// Before each chunk of the second phase.
     fn tick_levels(&self, done: u64, all: u64) {
         if self.is_due(false) {
@@ -453,8 +361,20 @@ impl<'a> Session<'a> {
         due && self.last_tick.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
     }
 
-    /// The second phase and the attributes; then the outputs are complete.
+    /// The second phase and the attributes; then the outputs are complete. The trace is written whatever happens.
     pub fn finish(mut self) -> Result<Report> {
+        let (finished, traced) = (self.finish_outputs(), self.write_trace());
+        finished.and(traced)?;
+        self.metrics.sample_memory();
+        Ok(self.report())
+    }
+
+    /// Writes the trace of what was done so far, where one is asked for.
+    pub fn write_trace(&self) -> Result<()> {
+        self.options.trace.as_ref().map_or(Ok(()), |path| self.trace.write(path))
+    }
+
+    fn finish_outputs(&mut self) -> Result<()> {
         let open = self.done.iter().filter(|d| !is_done(d)).count();
         if open > 0 {
             return Err(Error::Failed(format!("{open} of {} tasks are not done", self.done.len())));
@@ -463,17 +383,18 @@ impl<'a> Session<'a> {
         let unfinished = self.plan.outputs.iter().zip(&self.targets);
         let all: usize = unfinished.filter_map(|(o, t)| Some(second::voxels(o, t.as_ref()?))).sum();
         let done = AtomicU64::new(0);
+        self.pool.trim(0);
         for o in 0..self.plan.outputs.len() {
             let Some(target) = self.targets[o].take() else { continue };
             let output = &self.plan.outputs[o];
-            let dir = Sink::work_dir(&output.spec.path);
+            let lanes = parked::chunks_at_once(&self.plan, output);
             let before = |chunk: Region| {
                 self.options.cancel.check()?;
                 let earlier = done.fetch_add(chunk.voxels() as u64, Ordering::Relaxed);
                 self.tick_levels(earlier, all as u64);
                 Ok(())
             };
-            let bytes = second::finish_levels(output, &target, &dir, &self.threads, &before)?;
+            let bytes = second::finish_levels(output, &target, (&self.threads, lanes), &before)?;
             self.metrics.bytes_written(bytes);
             let attributes = outputs::attributes(
                 self.config,
@@ -495,11 +416,7 @@ impl<'a> Session<'a> {
             journal::remove(&outputs::journal_dir(&self.plan));
         }
         self.trace.span("finish", start, &[]);
-        if let Some(path) = &self.options.trace {
-            self.trace.write(path)?;
-        }
-        self.metrics.sample_memory();
-        Ok(self.report())
+        Ok(())
     }
 
     /// What was done so far.

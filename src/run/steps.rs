@@ -1,5 +1,7 @@
 //! Runs one step of the graph on one brick: cuts what the kernel may see, applies the border rule and the mask.
 
+use std::sync::Arc;
+
 use super::lanes::gradient_out;
 use super::masked::views_of;
 use super::metrics::Metrics;
@@ -42,7 +44,8 @@ pub type Fetch<'a> = dyn Fn(WireId, Region, AnyViewMut) -> Result<()> + 'a;
 pub enum MaskValue {
     All,
     None,
-    Some(Vec<u8>),
+    /// Shared by the steps that have the same.
+    Some(Arc<Vec<u8>>),
 }
 
 impl<'a> Engine<'a> {
@@ -82,9 +85,9 @@ impl<'a> Engine<'a> {
         }
         let count = needed.iter().map(|&n| n as usize).sum::<usize>();
         match count {
-            0 => MaskValue::None,
+            0 if self.skip => MaskValue::None,
             n if n == needed.len() => MaskValue::All,
-            _ => MaskValue::Some(needed),
+            _ => MaskValue::Some(Arc::new(needed)),
         }
     }
 

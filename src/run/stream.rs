@@ -123,7 +123,8 @@ impl<W: Send> Stream<'_, W> {
             }
             let place = *next as u32;
             *next += 1;
-            let bytes = self.brick_bytes * work.brick.voxels() as u64 / self.brick_voxels.max(1);
+            let share = work.brick.voxels() as u128 * self.brick_bytes as u128 / u128::from(self.brick_voxels.max(1));
+            let bytes = u64::try_from(share).unwrap_or(u64::MAX).min(self.brick_bytes);
             // A brick cut by the volume's edge still has whole halos: count at least half.
             let (permit, waited) = budget.acquire(bytes.max(self.brick_bytes / 2));
             drop(next);
@@ -168,6 +169,8 @@ impl<W: Send> Stream<'_, W> {
             let start = Instant::now();
             let written = (self.deliver)(&done, work, &mut scratch);
             self.metrics.encode_ns.fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);
+            // The brick and what became of it: the most that it holds.
+            self.metrics.sample_memory();
             self.trace.span("levels+encode", start, &[("brick", format!("{:?}", work.brick))]);
             done.ready.into_iter().flat_map(|r| r.levels).for_each(|v| engine.pool.put(v));
             for value in done.values.into_iter().flatten() {

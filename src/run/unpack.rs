@@ -11,15 +11,6 @@ use crate::{Error, Result};
 /// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
 const QUIET: u64 = 64 << 20;
 
-/// The folder of files in scratch, which have no names: it goes as soon as they are made, whatever happens.
-struct Folder(PathBuf);
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
-
 /// Makes every source ready to be read.
 ///
 /// # Errors
@@ -33,14 +24,12 @@ pub fn unpack(
 ) -> Result<()> {
     let total: u64 = sources.iter().map(Source::spool_bytes).sum();
     let beside = config.outputs[0].path.parent().map_or_else(|| PathBuf::from("."), PathBuf::from);
-    let base = config.run.scratch.clone().unwrap_or(beside);
-    let folder = Folder(base.join(format!(".occlude-scratch-{}", std::process::id())));
+    let folder = config.run.scratch.clone().unwrap_or(beside);
     if total > 0 {
-        let failed = |e| Error::file(&folder.0, format!("cannot create scratch: {e}"));
-        std::fs::create_dir_all(&folder.0).map_err(failed)?;
+        std::fs::create_dir_all(&folder).map_err(|e| Error::file(&folder, format!("cannot create scratch: {e}")))?;
     }
     for (source, input) in sources.iter_mut().zip(&config.inputs) {
-        let prepared = source.prepare(&folder.0, &|bytes| {
+        let prepared = source.prepare(&folder, &|bytes| {
             if total > QUIET {
                 progress.update(bytes, total, 0, 0, "unpack");
             }

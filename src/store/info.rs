@@ -47,6 +47,20 @@ impl Orientation {
         self.matrix.iter().map(|row| row[column] * row[column]).sum::<f64>().sqrt()
     }
 
+    /// Which way `up` a picture is turned whose rows go along `axis` (0: z): toward the head (`'S'`) or the front (`'A'`) of
+    /// a body, with whether the index grows that way. `None` where rows go from side to side or the space is no body's.
+    pub fn upward(&self, axis: usize) -> Option<(char, bool)> {
+        let column = 2 - axis;
+        let row = (0..3).max_by(|&a, &b| self.matrix[a][column].abs().total_cmp(&self.matrix[b][column].abs()))?;
+        let grows = self.matrix[row][column] > 0.0;
+        match (self.space.as_str(), row) {
+            ("RAS" | "LPS", 2) => Some(('S', grows)),
+            ("RAS", 1) => Some(('A', grows)),
+            ("LPS", 1) => Some(('A', !grows)),
+            _ => None,
+        }
+    }
+
     /// Origin `[z, y, x]` where the matrix is diagonal and positive (to rounding).
     pub fn straight_origin(&self) -> Option<[f64; 3]> {
         let m = &self.matrix;
@@ -82,5 +96,28 @@ impl VolumeInfo {
     /// Total voxels of one component.
     pub fn voxels(&self) -> usize {
         self.shape.iter().product()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn up_is_toward_head_or_front() {
+        let of = |diagonal: [f64; 3], space: &str| {
+            let mut matrix = [[0.0; 4]; 3];
+            (0..3).for_each(|a| matrix[a][a] = diagonal[a]);
+            let o = Orientation { matrix, space: space.into() };
+            [0, 1, 2].map(|axis| o.upward(axis))
+        };
+        assert_eq!(of([1.0, 1.0, 1.0], "RAS"), [Some(('S', true)), Some(('A', true)), None]);
+        assert_eq!(of([-1.0, -2.0, -1.0], "RAS"), [Some(('S', false)), Some(('A', false)), None]);
+        assert_eq!(of([1.0, 1.0, 1.0], "LPS"), [Some(('S', true)), Some(('A', false)), None]);
+        assert_eq!(of([1.0, 1.0, 1.0], "scanner-xyz"), [None; 3]);
+        // Sagittal storage: z of the file goes to the left, y to the head.
+        let matrix = [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.9, 0.1, 0.0]];
+        let o = Orientation { matrix, space: "RAS".into() };
+        assert_eq!([0, 1, 2].map(|axis| o.upward(axis)), [None, Some(('S', true)), Some(('A', true))]);
     }
 }

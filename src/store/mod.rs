@@ -10,7 +10,7 @@ pub mod sink;
 pub mod source;
 pub mod spill;
 
-pub use info::VolumeInfo;
+pub use info::{Orientation, VolumeInfo};
 pub use layout::{LevelLayout, Pyramid};
 pub use open::{changed_by, named_files, open_inputs, said_of};
 pub use sink::{Sink, SinkSpec};

@@ -133,7 +133,7 @@ mod tests {
     fn quantise_rounds_half_even() {
         for i in 0..=100_000 {
             let o = i as f32 / 100_000.0;
-            assert_eq!(quantise(o), (255.0 * o as f64).round_ties_even() as u8, "{o}");
+            assert_eq!(quantise(o), (255.0 * o).round_ties_even() as u8, "{o}");
         }
         assert_eq!((quantise(0.5), quantise(1.0), quantise(0.0)), (128, 255, 0));
     }

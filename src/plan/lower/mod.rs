@@ -12,7 +12,7 @@ use super::{Prepass, lengths};
 use crate::config::{Config, Input, Modulation, ObscuranceOp, Op, Place, Ref, StageNode, op_channels};
 use crate::grid::Border;
 use crate::kernel::gaussian;
-use crate::stage::Reduce;
+use crate::stage::{Reduce, WindowChannel};
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 use ops::box_channel;
@@ -75,8 +75,20 @@ pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
             }
         }
     }
+    forget_mirrors(&mut lowering.out.graph);
     lowering.out.graph.demand_halos();
     Ok(lowering.out)
+}
+
+/// Voxels that `nearest` and `reflect` repeat lie in the window themselves: extremes need no copies of them.
+fn forget_mirrors(graph: &mut Graph) {
+    for step in &mut graph.steps {
+        let StepKind::Window { channels, .. } = &step.kind else { continue };
+        let extremes = channels.iter().all(|c| matches!(c, WindowChannel::Min | WindowChannel::Max));
+        if extremes && matches!(step.border, Border::Nearest | Border::Reflect) {
+            step.border = Border::Clip;
+        }
+    }
 }
 
 impl Lowered {

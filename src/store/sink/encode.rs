@@ -55,6 +55,20 @@ fn append_le<T: Voxel>(row: &[T], out: &mut Vec<u8>) {
     }
 }
 
+/// Appends `n` copies of a voxel. Volumes of one plane in chunks of 64 are mostly that: one by one they took five times as long
+/// as all else.
+fn append_repeated(voxel: &[u8], n: usize, out: &mut Vec<u8>) {
+    let (start, len) = (out.len(), n * voxel.len());
+    if voxel.iter().all(|b| *b == voxel[0]) {
+        return out.resize(start + len, voxel[0]);
+    }
+    out.extend_from_slice(&voxel[..voxel.len().min(len)]);
+    while out.len() < start + len {
+        let there = out.len() - start;
+        out.extend_from_within(start..start + there.min(len - there));
+    }
+}
+
 /// The voxels with one NaN for all, if there is any: its sign and payload hang on the instructions that made it, and a box of
 /// nothing else is stored as the fill value.
 fn one_nan<T: Voxel>(v: View<T>) -> Option<Vec<T>> {
@@ -128,7 +142,7 @@ impl Encoder {
     fn pad<T: Voxel>(&self, v: View<T>, chunk: Shape, out: &mut Vec<u8>) {
         let size = size_of::<T>();
         let [nz, ny, nx] = v.shape;
-        let repeat = |out: &mut Vec<u8>, n: usize| (0..n).for_each(|_| out.extend_from_slice(&self.fill));
+        let repeat = |out: &mut Vec<u8>, n: usize| append_repeated(&self.fill, n, out);
         out.reserve_exact(chunk.iter().product::<usize>() * size);
         if let Some(bytes) = whole(v, chunk) {
             return out.extend_from_slice(bytes);
@@ -181,6 +195,17 @@ mod tests {
         assert_eq!(encode(f64::NAN, &[f32::NAN, negative_nan], AnyView::F32), Encoded::Empty);
         assert_ne!(encode(f64::NAN, &[f32::NAN, 0.0], AnyView::F32), Encoded::Empty);
         assert_ne!(encode(0.0, &[0.0f64, -0.0], AnyView::F64), Encoded::Empty, "-0 is not 0");
+    }
+
+    #[test]
+    fn repeated_voxels_are_whole() {
+        for voxel in [&[7][..], &[0, 0], &[1, 2], &[0, 0, 192, 127], &[1, 2, 3, 4, 5, 6, 7, 8]] {
+            for n in [0, 1, 2, 3, 7, 64, 1000] {
+                let mut out = vec![9; 3];
+                append_repeated(voxel, n, &mut out);
+                assert_eq!(out, [vec![9; 3], voxel.repeat(n)].concat());
+            }
+        }
     }
 
     #[test]

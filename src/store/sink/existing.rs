@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use super::{Sink, files, flat};
+use super::{Sink, files, flat, waiting};
 use crate::{Error, Result};
 
 /// Marker in the work folder.
@@ -211,6 +211,7 @@ pub fn remove_work_dir(dir: &Path) -> Result<()> {
     if !is_real_dir(dir) {
         return Ok(());
     }
+    waiting::remove(dir)?;
     clear_work_dir(dir)?;
     gone(dir, fs::remove_dir_all(dir))
 }

@@ -8,6 +8,7 @@ mod flat;
 mod header;
 mod metadata;
 mod nifti;
+pub mod waiting;
 mod zarr;
 
 use std::path::{Path, PathBuf};

@@ -10,12 +10,16 @@ use super::spool::Packing;
 pub const READ: &str = "; codecs that are read: blosc, zstd, gzip, zlib, lz4 and bz2 of numcodecs, crc32c of Zarr v3, adler32, fletcher32, \
      shuffle, transpose and shards of them";
 
-/// The outermost codec of a chunk, where it is unpacked here.
+/// An outer codec of a chunk that is unpacked here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ChunkPacking {
     Stream(Packing),
     /// One block of LZ4 behind its unpacked size, 4 bytes little-endian, as numcodecs stores it.
     Lz4,
+    /// Frames need not say how large they are, and the library that decodes the rest would believe them.
+    Zstd,
+    /// Four bytes behind the others.
+    Crc32c,
 }
 
 impl ChunkPacking {
@@ -26,6 +30,7 @@ impl ChunkPacking {
             "zlib" => Some(ChunkPacking::Stream(Packing::Zlib)),
             "bz2" => Some(ChunkPacking::Stream(Packing::Bzip2)),
             "lz4" => Some(ChunkPacking::Lz4),
+            "zstd" => Some(ChunkPacking::Zstd),
             _ => None,
         }
     }
@@ -38,7 +43,28 @@ impl ChunkPacking {
         match self {
             ChunkPacking::Stream(packing) => packing.unpack(packed, want),
             ChunkPacking::Lz4 => lz4(packed, want),
+            ChunkPacking::Zstd => zstd(packed, want),
+            ChunkPacking::Crc32c => checked(packed).map(<[u8]>::to_vec),
         }
+    }
+}
+
+/// All that fits into `want` bytes, from one frame or more.
+fn zstd(packed: &[u8], want: u64) -> Result<Vec<u8>, String> {
+    let room = usize::try_from(want).map_err(|_| format!("{want} bytes are more than this machine can address"))?;
+    zstd::bulk::decompress(packed, room).map_err(|e| match e.to_string() {
+        text if text.contains("too small") => {
+            format!("the zstd data expand to more than the {want} bytes that the metadata say")
+        }
+        text => format!("the zstd data are broken: {text}"),
+    })
+}
+
+fn checked(packed: &[u8]) -> Result<&[u8], String> {
+    let (body, sum) = packed.split_last_chunk().ok_or("the checksum is cut off")?;
+    match crc32c::crc32c(body).to_le_bytes() == *sum {
+        true => Ok(body),
+        false => Err("its checksum (crc32c) is wrong".into()),
     }
 }
 
@@ -51,15 +77,24 @@ fn lz4(packed: &[u8], want: u64) -> Result<Vec<u8>, String> {
     lz4_flex::block::decompress(block, size as usize).map_err(|e| format!("the lz4 data are broken: {e}"))
 }
 
-/// Takes the last codec off a list of v3 codecs if it is unpacked here, and gives the others the names of Zarr v3.
-pub fn take_outermost(codecs: &mut Value) -> Option<ChunkPacking> {
-    let list = codecs.as_array_mut()?;
-    let packing = ChunkPacking::named(codec_name(list.last()?));
-    if packing.is_some() {
+/// Takes those codecs off the end of a list of v3 codecs that are unpacked here, the outermost first, and gives the others the
+/// names of Zarr v3. A checksum is taken only with what it stands around.
+pub fn take_outermost(codecs: &mut Value) -> Vec<ChunkPacking> {
+    let mut taken = Vec::new();
+    let Some(list) = codecs.as_array_mut() else { return taken };
+    let named = |codec: Option<&Value>| codec.and_then(|c| ChunkPacking::named(codec_name(c)));
+    while let Some(last) = list.last() {
+        let inside = list.len().checked_sub(2).and_then(|i| named(list.get(i)));
+        let packing = match codec_name(last) {
+            "crc32c" => inside.map(|_| ChunkPacking::Crc32c),
+            name => ChunkPacking::named(name),
+        };
+        let Some(packing) = packing else { break };
+        taken.push(packing);
         list.pop();
     }
     list.iter_mut().for_each(rename);
-    packing
+    taken
 }
 
 /// Name of a v3 codec.
@@ -156,11 +191,29 @@ mod tests {
     #[test]
     fn only_the_outermost_codec_is_taken() {
         let mut codecs = json!([{ "name": "bytes" }, { "name": "numcodecs.blosc", "configuration": { "shuffle": 1 } }]);
-        assert_eq!(take_outermost(&mut codecs), None);
+        assert_eq!(take_outermost(&mut codecs), []);
         assert_eq!(codec_name(&codecs[1]), "blosc");
         let mut codecs = json!([{ "name": "bytes" }, { "name": "gzip" }, { "name": "numcodecs.bz2" }]);
-        assert_eq!(take_outermost(&mut codecs), Some(ChunkPacking::Stream(Packing::Bzip2)));
-        assert_eq!(codecs.as_array().unwrap().len(), 2);
+        assert_eq!(take_outermost(&mut codecs), [Packing::Bzip2, Packing::Gzip].map(ChunkPacking::Stream));
+        assert_eq!(codecs.as_array().unwrap().len(), 1);
+        let mut codecs = json!([{ "name": "bytes" }, { "name": "zstd" }, { "name": "crc32c" }]);
+        assert_eq!(take_outermost(&mut codecs), [ChunkPacking::Crc32c, ChunkPacking::Zstd]);
+        let mut codecs = json!([{ "name": "bytes" }, { "name": "blosc" }, { "name": "crc32c" }]);
+        assert_eq!(take_outermost(&mut codecs), []);
+    }
+
+    #[test]
+    fn zstd_that_hides_its_size_is_bounded() {
+        // Blocks of one byte each, run 128 KiB long, in a frame that does not say how many there are.
+        let block = |last: u32| [&((131072u32 << 3) | (1 << 1) | last).to_le_bytes()[..3], &[7]].concat();
+        let frame = |n: usize| [vec![0x28, 0xb5, 0x2f, 0xfd, 0x00, 0x38], block(0).repeat(n - 1), block(1)].concat();
+        assert_eq!(ChunkPacking::Zstd.unpack(&frame(3), 3 << 17).unwrap(), vec![7; 3 << 17]);
+        assert!(ChunkPacking::Zstd.unpack(&frame(24_000), 4096).unwrap_err().contains("more than the 4096"));
+        assert!(ChunkPacking::Zstd.unpack(&frame(3)[..9], 3 << 17).unwrap_err().contains("broken"));
+        let sum = crc32c::crc32c(b"abc").to_le_bytes();
+        assert_eq!(ChunkPacking::Crc32c.unpack(&[b"abc", &sum[..]].concat(), 3).unwrap(), b"abc");
+        assert!(ChunkPacking::Crc32c.unpack(&[b"abd", &sum[..]].concat(), 3).is_err());
+        assert!(ChunkPacking::Crc32c.unpack(b"ab", 3).is_err());
     }
 
     #[test]

@@ -15,9 +15,19 @@ pub struct Shard {
     path: PathBuf,
     file: File,
     len: u64,
-    /// First byte and length per inner chunk; both all ones where it is not stored.
-    index: Vec<[u64; 2]>,
+    index: Index,
 }
+
+/// First byte and length per inner chunk, little-endian; both all ones where it is not stored.
+#[derive(Debug)]
+enum Index {
+    Held(Vec<u8>),
+    /// Stays in the file, from this byte on, since it is large.
+    InFile(u64),
+}
+
+const ENTRY: usize = 16;
+const ABSENT: [u64; 2] = [u64::MAX; 2];
 
 impl Shard {
     /// Reads and checks the index.
@@ -27,23 +37,53 @@ impl Shard {
         if len < size {
             return Err(Error::file(&path, format!("the shard has {len} bytes, its index alone needs {size}")));
         }
-        let mut bytes = vec![0; size as usize];
-        let at = if meta.index_at_end { len - size } else { 0 };
-        file.read_exact_at(&mut bytes, at).map_err(|e| Error::file(&path, e))?;
+        let start = if meta.index_at_end { len - size } else { 0 };
+        let read = |bytes: &mut [u8], at| file.read_exact_at(bytes, at).map_err(|e| Error::file(&path, e));
+        // In blocks: the index of a shard that is large is not held even while its sum is made.
+        let mut block = vec![0; (MOST_HELD.min(entries) as usize) * ENTRY];
+        let (mut sum, mut at) = (0, 0);
+        while at < entries * ENTRY as u64 && (meta.index_crc || entries <= MOST_HELD) {
+            let n = (block.len() as u64).min(entries * ENTRY as u64 - at) as usize;
+            read(&mut block[..n], start + at)?;
+            sum = crc32c::crc32c_append(sum, &block[..n]);
+            at += n as u64;
+        }
         if meta.index_crc {
-            let sum = bytes.split_off(bytes.len() - 4);
-            if crc32c::crc32c(&bytes).to_le_bytes() != sum[..] {
+            let mut stored = [0; 4];
+            read(&mut stored, start + at)?;
+            if sum.to_le_bytes() != stored {
                 return Err(Error::file(&path, "the shard's index is corrupt (its checksum is wrong)"));
             }
         }
-        let number = |b: &[u8; 8]| u64::from_le_bytes(*b);
-        let index = bytes.as_chunks::<8>().0.as_chunks::<2>().0.iter().map(|[a, b]| [number(a), number(b)]).collect();
+        let index = if entries <= MOST_HELD { Index::Held(block) } else { Index::InFile(start) };
         Ok(Shard { path, file, len, index })
     }
 
-    /// Whether the index has an inner chunk.
+    /// First byte and length of an inner chunk.
+    fn entry(&self, entry: usize) -> Result<[u64; 2]> {
+        let mut raw = [0; ENTRY];
+        match &self.index {
+            Index::Held(bytes) => raw.copy_from_slice(&bytes[entry * ENTRY..][..ENTRY]),
+            Index::InFile(start) => {
+                let at = start + (entry * ENTRY) as u64;
+                self.file.read_exact_at(&mut raw, at).map_err(|e| Error::file(&self.path, e))?;
+            }
+        }
+        let [first, second] = raw.as_chunks::<8>().0 else { unreachable!("an entry is two numbers") };
+        Ok([u64::from_le_bytes(*first), u64::from_le_bytes(*second)])
+    }
+
+    /// Whether the index has an inner chunk. One that cannot be asked says so when it is read.
     pub fn holds(&self, entry: usize) -> bool {
-        self.index[entry] != [u64::MAX; 2]
+        self.entry(entry).map_or(true, |entry| entry != ABSENT)
+    }
+
+    /// Bytes of memory of its index.
+    fn held(&self) -> usize {
+        match &self.index {
+            Index::Held(bytes) => bytes.len(),
+            Index::InFile(_) => 0,
+        }
     }
 
     pub fn path(&self) -> &Path {
@@ -52,8 +92,8 @@ impl Shard {
 
     /// Stored bytes of entry `entry`; `None` where it is not stored.
     pub fn read(&self, entry: usize, chunk: &[u64], most: u64) -> Result<Option<Vec<u8>>> {
-        let [start, len] = self.index[entry];
-        if start == u64::MAX && len == u64::MAX {
+        let [start, len] = self.entry(entry)?;
+        if [start, len] == ABSENT {
             return Ok(None);
         }
         if start.checked_add(len).is_none_or(|end| end > self.len) || len > most {
@@ -72,8 +112,10 @@ impl Shard {
 
 /// Shards whose files stay open.
 const MOST_SHARDS: usize = 64;
-/// Entries of all kept indexes together (16 bytes each).
-const MOST_ENTRIES: usize = 4 << 20;
+/// Entries of an index that is held in memory: a file of 256^3 voxels in chunks of 8^3 has half as many.
+const MOST_HELD: u64 = 1 << 16;
+/// Bytes of all held indexes together, which no budget counts.
+const MOST_BYTES: usize = 4 << 20;
 
 type Kept = HashMap<Vec<u64>, (u64, Option<Arc<Shard>>)>;
 
@@ -100,8 +142,8 @@ impl Shards {
         let mut kept = self.kept.lock().unwrap_or_else(|e| e.into_inner());
         let now = kept.0;
         kept.1.insert(outer.to_vec(), (now, shard.clone()));
-        let entries = |kept: &Kept| kept.values().flat_map(|(_, s)| s).map(|s| s.index.len()).sum::<usize>();
-        while kept.1.len() > 1 && (kept.1.len() > MOST_SHARDS || entries(&kept.1) > MOST_ENTRIES) {
+        let bytes = |kept: &Kept| kept.values().flat_map(|(_, s)| s).map(|s| s.held()).sum::<usize>();
+        while kept.1.len() > 1 && (kept.1.len() > MOST_SHARDS || bytes(&kept.1) > MOST_BYTES) {
             let oldest = kept.1.iter().min_by_key(|(_, (used, _))| *used).map(|(k, _)| k.clone());
             if let Some(oldest) = oldest {
                 kept.1.remove(&oldest);
@@ -114,6 +156,35 @@ impl Shards {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Large indexes stay in the file, with the same answers; a wrong sum is found in either.
+    #[test]
+    fn large_indexes_are_not_held() {
+        let dir = tempfile::tempdir().unwrap();
+        for entries in [9, MOST_HELD + 3] {
+            let path = dir.path().join(entries.to_string());
+            let mut bytes = b"abcd".to_vec();
+            for entry in 0..entries {
+                let [start, len] = if entry == entries - 2 { [1, 3] } else { ABSENT };
+                bytes.extend(start.to_le_bytes().into_iter().chain(len.to_le_bytes()));
+            }
+            let sum = crc32c::crc32c(&bytes[4..]);
+            bytes.extend(sum.to_le_bytes());
+            let meta =
+                ShardMeta { codecs: serde_json::Value::Null, index_at_end: true, index_crc: true, grid: vec![entries] };
+            let open = |bytes: &[u8]| {
+                std::fs::write(&path, bytes).unwrap();
+                Shard::open(path.clone(), File::open(&path).unwrap(), bytes.len() as u64, &meta)
+            };
+            let shard = open(&bytes).unwrap();
+            assert_eq!(shard.held() > 0, entries <= MOST_HELD);
+            assert!(shard.holds(entries as usize - 2) && !shard.holds(entries as usize - 1) && !shard.holds(0));
+            assert_eq!(shard.read(entries as usize - 2, &[0], 64).unwrap().unwrap(), b"bcd");
+            assert_eq!(shard.read(1, &[0], 64).unwrap(), None);
+            bytes[4 + 16 * 7] ^= 1;
+            assert!(open(&bytes).unwrap_err().to_string().contains("checksum"));
+        }
+    }
 
     #[test]
     fn the_least_recently_used_shard_is_dropped() {

@@ -173,7 +173,7 @@ pub fn nameless(scratch: &Path, len: u64) -> Result<File> {
     }
     let failed = |e: std::io::Error| Error::file(scratch, format!("scratch file: {e}"));
     for attempt in 0..1000u32 {
-        let path = scratch.join(format!(".spool-{}-{attempt}", std::process::id()));
+        let path = scratch.join(format!(".occlude-spool-{}-{attempt}", std::process::id()));
         match File::options().read(true).write(true).create_new(true).open(&path) {
             Ok(file) => {
                 std::fs::remove_file(&path).map_err(failed)?;

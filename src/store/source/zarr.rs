@@ -277,7 +277,7 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
     // A server's clock may run ahead of this machine's.
     let touched = folder.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
     let opened = touched.max(SystemTime::now());
-    let plain_blosc = meta.packing.is_none() && meta.inner[..lead].iter().all(|n| *n == 1) && meta.is_plain_blosc();
+    let plain_blosc = meta.packings.is_empty() && meta.inner[..lead].iter().all(|n| *n == 1) && meta.is_plain_blosc();
     Ok((
         info,
         ZarrArray {
@@ -356,14 +356,14 @@ impl ZarrArray {
                 return Ok(ChunkRead::Data { stored_bytes });
             }
         }
-        let unpacked = chunk_codecs::unpacked_bytes(&self.meta.codecs, want, self.most_encoded());
-        let bytes = match self.meta.packing {
-            Some(packing) => packing.unpack(&bytes, *unpacked.end()).map_err(corrupt)?,
-            None => {
-                chunk_codecs::check_declared(&bytes, &unpacked, &self.meta.codecs).map_err(corrupt)?;
-                bytes
-            }
-        };
+        let mut codecs = &self.meta.codecs[..];
+        for packing in &self.meta.packings {
+            let unpacked = chunk_codecs::unpacked_bytes(codecs, want, self.most_encoded());
+            bytes = packing.unpack(&bytes, *unpacked.end()).map_err(corrupt)?;
+            codecs = &codecs[..codecs.len() - 1];
+        }
+        let unpacked = chunk_codecs::unpacked_bytes(codecs, want, self.most_encoded());
+        chunk_codecs::check_declared(&bytes, &unpacked, codecs).map_err(corrupt)?;
         let decoded = guarded(|| {
             let (kind, fill) = (self.array.data_type(), self.array.fill_value());
             self.codecs.decode(Cow::Owned(bytes), &self.inner, kind, fill, &self.options).map_err(|e| e.to_string())

@@ -32,10 +32,10 @@ pub struct ArrayMeta {
     pub shard: Option<ShardMeta>,
     /// Names of the codecs of an inner chunk, the first applied first when written.
     pub codecs: Vec<String>,
-    /// The outermost of them where it is unpacked here, with a bound; `value` lacks it.
-    pub packing: Option<ChunkPacking>,
+    /// Those of them that are unpacked here, with a bound, the outermost first; `value` lacks them.
+    pub packings: Vec<ChunkPacking>,
     pub names: Vec<Option<String>>,
-    /// The metadata, without that codec.
+    /// The metadata, without those codecs.
     pub value: Value,
     /// The metadata file's text.
     pub text: Vec<u8>,
@@ -174,7 +174,7 @@ fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
         inner: outer.clone(),
         shard: None,
         codecs: names(list),
-        packing: None,
+        packings: Vec::new(),
         value: Value::Null,
         shape,
         dtype,
@@ -206,10 +206,10 @@ fn array_v3(path: &Path, mut value: Value, text: Vec<u8>) -> Result<ArrayMeta> {
         };
         meta.codecs = names(config["codecs"].as_array().ok_or_else(|| broken("a shard without codecs".into()))?);
         let inner = &mut value["codecs"][0]["configuration"]["codecs"];
-        meta.packing = take_outermost(inner);
+        meta.packings = take_outermost(inner);
         meta.shard = Some(ShardMeta { codecs: inner.clone(), index_at_end, index_crc, grid });
     } else {
-        meta.packing = take_outermost(&mut value["codecs"]);
+        meta.packings = take_outermost(&mut value["codecs"]);
     }
     check_chunk(path, &meta)?;
     meta.value = value;
@@ -228,8 +228,8 @@ fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> 
     let filters = value["filters"].as_array().map_or(&[][..], |l| l);
     let ids = filters.iter().chain([&value["compressor"]]).filter_map(|c| c["id"].as_str());
     let codecs: Vec<String> = ids.map(str::to_string).collect();
-    let packing = value["compressor"]["id"].as_str().and_then(ChunkPacking::named);
-    if packing.is_some() {
+    let packings = Vec::from_iter(value["compressor"]["id"].as_str().and_then(ChunkPacking::named));
+    if !packings.is_empty() {
         value["compressor"] = Value::Null;
     }
     let meta = ArrayMeta {
@@ -238,7 +238,7 @@ fn array_v2(path: &Path, mut value: Value, attributes: Value, text: Vec<u8>) -> 
         inner: outer.clone(),
         shard: None,
         codecs,
-        packing,
+        packings,
         value,
         shape,
         dtype,

@@ -92,7 +92,7 @@ impl Openness for u8 {
     #[inline(always)]
     unsafe fn put<L: F32x32>(openness: L, to: *mut u8) {
         // SAFETY: the caller's promise.
-        unsafe { openness.fused(L::splat(255.0), L::splat(ROUNDED)).store_codes(to) }
+        unsafe { openness.times(L::splat(255.0)).plus(L::splat(ROUNDED)).store_codes(to) }
     }
 }
 
