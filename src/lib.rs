@@ -11,7 +11,7 @@
 //! | [`kernel`] | voxels to voxels on the CPU; each fast kernel beside its reference |
 //! | [`config`] | TOML text to typed configuration |
 //! | [`store`] | boxes of voxels from and to files |
-//! | [`gpu`] | windows, obscurance and Gaussians on a GPU, their facts for the planner |
+//! | [`gpu`] | most stages on a GPU, and what the planner knows of them |
 //! | [`plan`] | graph to plan: lattices, halos, fusing, bricks, tasks, peak bytes |
 //! | [`run`] | executes a plan: readers, workers, writers, byte budget, journal |
 //! | [`cli`] | commands, messages, reports |

@@ -70,6 +70,13 @@ macro_rules! from_vec {
 from_vec!(U8: u8, I8: i8, U16: u16, I16: i16, U32: u32, I32: i32, F32: f32, F64: f64);
 
 impl Voxels {
+    /// One voxel, rounded and saturated to the type.
+    pub fn one(dtype: DType, value: f64) -> Voxels {
+        let mut voxel = Voxels::zeroed(dtype, 1);
+        voxel.fill(value);
+        voxel
+    }
+
     /// Voxels held.
     pub fn len(&self) -> usize {
         with_voxels!(self, v => v.len())

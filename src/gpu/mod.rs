@@ -21,7 +21,7 @@
 //! | `rate` | how fast a device moves memory |
 //! | `windows`, `float_windows`, `obscurance`, `gaussian`, `gradient` | calls like the CPU kernels' |
 //!
-//! Everything above `backend` knows no wgpu.
+//! What records work knows no wgpu: `backend`, `device`, `slot`, `engine`, `probe` and the calls do.
 
 mod backend;
 pub mod device;

@@ -9,7 +9,7 @@ use super::decodes;
 use super::graph::{Producer, Step, StepId};
 use super::skips::{self, Known};
 use super::tasks::input_halo;
-use super::{FlowPlan, Group, Plan, flows};
+use super::{FlowPlan, Group, Placed, Plan, flows};
 use crate::Result;
 use crate::config::Config;
 use crate::grid::Region;
@@ -49,8 +49,8 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
         }
     }
     for (s, step) in plan.graph.steps.iter().enumerate() {
-        let (_, device, reason) = &plan.placement[s];
-        let _ = writeln!(w, "step {s}: {} -> {} on {device} ({reason})", reads(plan, step), makes(plan, step));
+        let Placed { lane, why, .. } = &plan.placement[s];
+        let _ = writeln!(w, "step {s}: {} -> {} on {} ({why})", reads(plan, step), makes(plan, step), lane.name());
         let _ = writeln!(w, "  {}, reach {:?}, halo beyond the brick {:?}", step.kind.name(), step.reach, step.halo);
         if let Some(flow) = plan.flow_of(s) {
             let _ = writeln!(w, "  {}", flow_text(plan, &plan.flows[flow], s));
@@ -62,8 +62,8 @@ fn text(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Known>
             let _ = writeln!(w, "  one pass for {}", step.stages.join(", "));
         }
     }
-    for (_, device, reason) in (0..plan.outputs.len()).filter_map(|o| plan.map_placement(o)) {
-        let _ = writeln!(w, "occlusion map on {device} ({reason})");
+    for Placed { lane, why, .. } in (0..plan.outputs.len()).filter_map(|o| plan.map_placement(o)) {
+        let _ = writeln!(w, "occlusion map on {} ({why})", lane.name());
     }
     for (group, known) in plan.groups.iter().zip(skips) {
         group_text(w, plan, group);
@@ -256,10 +256,10 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         .iter()
         .zip(&plan.placement)
         .enumerate()
-        .map(|(s, (step, (_, device, reason)))| {
+        .map(|(s, (step, placed))| {
             json!({
                 "stages": step.stages, "kernel": step.kind.name(), "reads": reads(plan, step), "makes": makes(plan, step),
-                "reach": step.reach, "halo": step.halo, "streamed": step.streamed.is_some(), "device": device, "reason": reason,
+                "reach": step.reach, "halo": step.halo, "streamed": step.streamed.is_some(), "device": placed.lane.name(), "reason": placed.why,
                 "gpu_flow": plan.flow_of(s),
             })
         })
@@ -298,7 +298,7 @@ fn describe(config: &Config, plan: &Plan, sources: &[Source], skips: &[Option<Kn
         "steps": steps,
         "groups": groups,
         "outputs": outputs,
-        "placement": plan.placement.iter().map(|(n, d, _)| (n.clone(), json!(d))).collect::<serde_json::Map<_, _>>(),
+        "placement": plan.placement.iter().map(|p| (p.name.clone(), json!(p.lane.name()))).collect::<serde_json::Map<_, _>>(),
         "peak_memory_bytes": plan.groups.iter().flat_map(|g| [&g.brick].into_iter().chain(&g.prepass)).map(|b| b.peak(plan.workers)).max(),
         "memory_budget_bytes": plan.memory,
         "scratch_bytes": scratch(plan, sources),

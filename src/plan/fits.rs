@@ -2,7 +2,8 @@
 //! same, so that a resumed run, whose budget or brick may be another, may settle it anew.
 
 use super::graph::{StepId, StepKind};
-use super::{Plan, flows, memory};
+use super::place::{Cause, Lane};
+use super::{Plan, memory};
 use crate::gpu::Unfit;
 
 /// Takes apart the flows and leaves to the CPU the sweeps that do not fit; the placement says why.
@@ -18,8 +19,7 @@ pub fn settle(plan: &mut Plan) {
             && plan.flow_of(s).is_none()
             && let Some(why) = unfit_sweep(plan, s, cap)
         {
-            let place = &mut plan.placement[s];
-            (place.1, place.2) = ("cpu", format!("the sweep {why}: runs on the CPU"));
+            plan.placement[s].go(Lane::Cpu, Cause::Facts, format!("the sweep {why}: runs on the CPU"));
         }
     }
 }
@@ -45,10 +45,11 @@ fn part(plan: &mut Plan, f: usize, why: Unfit) {
     let what = format!("in one go {} {why}", names.join(", "));
     for s in flow.steps {
         let place = &mut plan.placement[s];
-        if place.2 == flows::BESIDE {
-            (place.1, place.2) = ("cpu", format!("looks at one voxel, and {what}: runs on the CPU"));
-        } else {
-            place.2 += &format!("; by itself, its levels on the CPU: {what}");
+        match place.cause {
+            Cause::Beside => {
+                place.go(Lane::Cpu, Cause::Facts, format!("looks at one voxel, and {what}: runs on the CPU"));
+            }
+            _ => place.why += &format!("; by itself, its levels on the CPU: {what}"),
         }
     }
 }

@@ -259,9 +259,7 @@ pub fn build(plan: &Plan, flow: &FlowPlan, site: &Site) -> Option<(Flow, Vec<Tar
 fn fills(graph: &Graph, step: &Step) -> Vec<f32> {
     let of = |w: &WireId| {
         let wire = &graph.wires[*w];
-        let mut fill = Voxels::zeroed(wire.dtype, 1);
-        fill.fill(wire.fill);
-        vec![fill.at(0) as f32; wire.components]
+        vec![Voxels::one(wire.dtype, wire.fill).at(0) as f32; wire.components]
     };
     step.outputs.iter().flat_map(of).collect()
 }

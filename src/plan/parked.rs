@@ -6,10 +6,6 @@ use super::{OutputPlan, Plan};
 use crate::grid::{Region, Shape, order::morton};
 use crate::kernel::reduce;
 
-/// Chunks per axis of a task that are looked at: the curve is alike in all its parts, and bricks are seldom so much smaller
-/// than chunks.
-const LOOKED_AT: usize = 64;
-
 /// Open chunks of the levels between their first and last brick, for one task, all outputs, and those that are being encoded.
 pub fn parked_bytes(plan: &Plan, group: &Group) -> u64 {
     let (mut total, mut encoding) = (0, 0);
@@ -78,7 +74,9 @@ fn open_chunks(task: Shape, brick: Shape, span: Shape, bricks: usize, several: b
     if (0..3).all(|a| brick[a].is_multiple_of(span[a]) || brick[a] >= task[a]) {
         return 0;
     }
-    let looked: Shape = std::array::from_fn(|a| task[a].div_ceil(span[a]).min(LOOKED_AT.max(2 * touched[a])));
+    // The curve is alike in all cubes of bricks that hold a chunk's longest row of them: a few such cubes say it all.
+    let row = (0..3).map(|a| span[a].min(task[a]).div_ceil(brick[a])).max().unwrap_or(1).next_power_of_two();
+    let looked: Shape = std::array::from_fn(|a| task[a].div_ceil(span[a]).min(4 * row.max(touched[a])));
     let (mut begins, mut ends) = (Vec::new(), Vec::new());
     for c in Region::whole(looked).iter() {
         let c = c.map(|v| v as usize);
@@ -173,6 +171,15 @@ mod tests {
             assert_eq!(open, played(task, brick, span), "{task:?} in {brick:?} of {span:?}");
         }
         assert_eq!(open_chunks([64, 512, 4096], [8, 512, 64], [64; 3], 1, true), 64);
+        // Tasks of more chunks than are looked at.
+        for (task, brick, span) in [
+            ([320, 256, 512], [8, 32, 16], [16, 16, 32]),
+            ([256, 64, 700], [8, 24, 40], [16, 16, 16]),
+            ([512, 64, 512], [64, 8, 8], [32, 32, 8]),
+        ] {
+            let open = open_chunks(task, brick, span, 1, false);
+            assert_eq!(open, played(task, brick, span), "{task:?} in {brick:?} of {span:?}");
+        }
         // The next task's first bricks begin theirs while the last of this one are written.
         assert_eq!(open_chunks([64, 512, 512], [8, 512, 64], [64; 3], 4, false), 64);
         assert_eq!(open_chunks([64, 512, 512], [8, 512, 64], [64; 3], 4, true), 64);

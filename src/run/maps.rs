@@ -223,8 +223,7 @@ fn uniform(
 ) -> Result<()> {
     let map = output.map.as_ref().expect("the caller saw a map");
     let spec = target.sink.spec();
-    let mut fill = Voxels::zeroed(spec.dtype, 1);
-    fill.fill(spec.fill);
+    let fill = Voxels::one(spec.dtype, spec.fill);
     for k in map.first..=output.brick_level() {
         let own = output.level_box(k, brick);
         for (component, &which) in map.moments.iter().enumerate() {

@@ -20,10 +20,10 @@ pub struct RunOptions {
     pub cancel: Cancel,
 }
 
-/// Told how far a run is. Called from any thread, at most a few times a second per thread.
+/// Told how far a run is. Called from any thread, some ten times a second; while unpacking after every mebibyte.
 pub trait Progress: Sync {
     /// Level-0 voxels and bricks that are done, of all that there are to do; `phase` names what goes on: `unpack`
-    /// (bytes), `compute`, `levels` (voxels of the levels that bricks do not make).
+    /// (bytes), `pre-pass`, `compute`, `levels` (voxels of the levels that bricks do not make).
     fn update(&self, done_voxels: u64, total_voxels: u64, bricks_done: u64, bricks_total: u64, phase: &str);
     /// Something that the user should know, once.
     fn note(&self, text: &str);

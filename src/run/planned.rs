@@ -7,12 +7,13 @@ use super::outputs;
 use crate::Result;
 use crate::config::{Config, Device};
 use crate::gpu::{self, Gpu};
-use crate::plan::Plan;
+use crate::plan::{Placed, Plan};
 use crate::store::{Source, VolumeInfo};
 
 /// Where everything runs and why, for who reads the journal.
 pub fn reasons(plan: &Plan) -> Value {
-    plan.placement.iter().map(|(name, device, why)| json!({ "stage": name, "device": device, "why": why })).collect()
+    let one = |p: &Placed| json!({ "stage": p.name, "device": p.lane.name(), "why": p.why });
+    plan.placement.iter().map(one).collect()
 }
 
 /// Plans, and opens the GPU where a step runs on it. With `auto`, a run that was begun without a GPU goes on without one.

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::metrics::{FlowTotals, Metrics, StepTotals};
-use crate::plan::Plan;
 use crate::plan::graph::StepId;
+use crate::plan::{Lane, Placed, Plan};
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Report {
@@ -87,13 +87,13 @@ pub(super) fn stages(plan: &Plan, metrics: &Metrics) -> Vec<StageReport> {
 
 fn stage(plan: &Plan, metrics: &Metrics, s: StepId) -> StageReport {
     let StepTotals { seconds, core_seconds, voxels } = metrics.step_totals(s);
-    let (_, device, reason) = &plan.placement[s];
+    let Placed { lane, why, .. } = &plan.placement[s];
     StageReport {
         name: plan.graph.steps[s].stages.join("+"),
         seconds,
-        core_seconds: (*device == "cpu").then_some(core_seconds),
-        device: device.to_string(),
-        reason: reason.clone(),
+        core_seconds: (*lane == Lane::Cpu).then_some(core_seconds),
+        device: lane.name().into(),
+        reason: why.clone(),
         voxels,
         bricks_on_cpu: metrics.shared_bricks(s),
         lines: metrics.line_counts(s),
@@ -111,7 +111,7 @@ fn flow(plan: &Plan, metrics: &Metrics, f: usize) -> Option<StageReport> {
         name: format!("{} in one go", stages.join(", ")),
         seconds,
         device: "gpu".into(),
-        reason: plan.placement[steps[0]].2.clone(),
+        reason: plan.placement[steps[0]].why.clone(),
         voxels,
         together: Some(Together { stages, bricks, bricks_left: left }),
         ..StageReport::default()

@@ -427,7 +427,7 @@ impl<'a> Session<'a> {
         report.memory_budget_bytes = self.plan.memory;
         report.stages = report::stages(&self.plan, &self.metrics);
         report.byte_identity_waived = self.plan.waives_byte_identity();
-        report.placement = self.plan.placement.iter().map(|(n, d, _)| (n.clone(), d.to_string())).collect();
+        report.placement = self.plan.placement.iter().map(|p| (p.name.clone(), p.lane.name().into())).collect();
         report
     }
 

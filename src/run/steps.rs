@@ -95,8 +95,7 @@ impl<'a> Engine<'a> {
     fn mask_of_constant(&self, mask: &Mask, value: f64) -> MaskValue {
         let WhereRule::Range { min, max } = mask.rule else { return MaskValue::None };
         let wire = &self.plan.graph.wires[mask.wire];
-        let (mut voxel, mut needed) = (Voxels::zeroed(wire.dtype, 1), [0]);
-        voxel.fill(value);
+        let (voxel, mut needed) = (Voxels::one(wire.dtype, value), [0]);
         mask::range(voxel.view([1; 3]), wire.affine, wire.missing, min, max, ViewMut::dense(&mut needed, [1; 3]));
         if needed == [1] { MaskValue::All } else { MaskValue::None }
     }
@@ -171,11 +170,7 @@ impl<'a> Engine<'a> {
             .iter()
             .zip(constants)
             .map(|(v, constants)| {
-                let comps = constants.into_iter().map(|c| {
-                    let mut voxel = Voxels::zeroed(v.dtype, 1);
-                    voxel.fill(c);
-                    Comp::Voxels(voxel)
-                });
+                let comps = constants.into_iter().map(|c| Comp::Voxels(Voxels::one(v.dtype, c)));
                 Value { dtype: v.dtype, region: one, comps: comps.collect() }
             })
             .collect();

@@ -61,7 +61,7 @@ impl FirstError {
     }
 }
 
-/// The next brick and its bytes, handed out in order.
+/// The next brick, handed out in order.
 struct Queue<'a> {
     next: Mutex<usize>,
     work: &'a [Work],

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::sync::Mutex;
+use std::thread::ThreadId;
 use std::time::Instant;
 
 use crate::{Error, Result};
@@ -10,44 +11,53 @@ use crate::{Error, Result};
 #[derive(Debug)]
 pub struct Trace {
     start: Instant,
-    events: Option<Mutex<String>>,
+    spans: Option<Mutex<Spans>>,
+}
+
+#[derive(Debug, Default)]
+struct Spans {
+    text: String,
+    /// Threads by number.
+    threads: Vec<ThreadId>,
 }
 
 impl Trace {
     pub fn new(on: bool) -> Trace {
-        Trace { start: Instant::now(), events: on.then(Mutex::default) }
+        Trace { start: Instant::now(), spans: on.then(Mutex::default) }
     }
 
     /// A span from `start` until now on the calling thread.
     pub fn span(&self, name: &str, start: Instant, args: &[(&str, String)]) {
-        let Some(events) = &self.events else { return };
+        let Some(spans) = &self.spans else { return };
         let args: serde_json::Map<String, serde_json::Value> =
             args.iter().map(|(k, v)| (k.to_string(), v.clone().into())).collect();
+        let (at, took) = (start.duration_since(self.start).as_secs_f64(), start.elapsed().as_secs_f64());
+        let mut spans = spans.lock().unwrap_or_else(|e| e.into_inner());
         let event = serde_json::json!({
-            "name": name, "ph": "X", "pid": 1, "tid": thread_number(),
-            "ts": start.duration_since(self.start).as_secs_f64() * 1e6,
-            "dur": start.elapsed().as_secs_f64() * 1e6,
-            "args": args,
+            "name": name, "ph": "X", "pid": 1, "tid": spans.number(std::thread::current().id()),
+            "ts": at * 1e6, "dur": took * 1e6, "args": args,
         });
-        let mut events = events.lock().unwrap_or_else(|e| e.into_inner());
-        if !events.is_empty() {
-            events.push_str(",\n");
+        if !spans.text.is_empty() {
+            spans.text.push_str(",\n");
         }
-        events.push_str(&event.to_string());
+        spans.text.push_str(&event.to_string());
     }
 
     pub fn write(&self, path: &Path) -> Result<()> {
-        let Some(events) = &self.events else { return Ok(()) };
-        let events = events.lock().unwrap_or_else(|e| e.into_inner());
-        let text = ["{\"displayTimeUnit\":\"ms\",\"traceEvents\":[\n", &events, "\n]}\n"].concat();
+        let Some(spans) = &self.spans else { return Ok(()) };
+        let spans = spans.lock().unwrap_or_else(|e| e.into_inner());
+        let text = ["{\"displayTimeUnit\":\"ms\",\"traceEvents\":[\n", &spans.text, "\n]}\n"].concat();
         std::fs::write(path, text).map_err(|e| Error::file(path, format!("cannot write the trace: {e}")))
     }
 }
 
-/// A small number for the calling thread: rayon workers by index, others after them.
-fn thread_number() -> usize {
-    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
-    static NEXT: AtomicUsize = AtomicUsize::new(1);
-    thread_local!(static NUMBER: usize = NEXT.fetch_add(1, Relaxed));
-    NUMBER.with(|n| *n)
+impl Spans {
+    /// A small number for a thread: 1 for the first that is seen.
+    fn number(&mut self, thread: ThreadId) -> usize {
+        let known = self.threads.iter().position(|t| *t == thread);
+        1 + known.unwrap_or_else(|| {
+            self.threads.push(thread);
+            self.threads.len() - 1
+        })
+    }
 }

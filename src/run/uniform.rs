@@ -27,8 +27,7 @@ impl Assembler<'_> {
     ) -> Result<bool> {
         let (output, spec) = (place.output, place.target.sink.spec());
         let Some((value, excluded)) = self.only_value(wire, comp, done) else { return Ok(false) };
-        let mut fill = Voxels::zeroed(spec.dtype, 1);
-        fill.fill(spec.fill);
+        let fill = Voxels::one(spec.dtype, spec.fill);
         // Moments of equal values may not be 0, and sums of f64 may round.
         let one = value.at(0);
         if !output.is_zarr() || output.reduce == Reduce::Moments || value.dtype() == DType::F64 || !one.is_finite() {
@@ -74,9 +73,8 @@ impl Assembler<'_> {
         }
         let dtype = wire.scaled_dtype();
         let plain = dtype == wire.dtype && wire.affine.is_identity();
-        let mut voxel = Voxels::zeroed(dtype, 1);
-        voxel.fill(if plain { stored } else { wire.affine.apply(stored) });
-        Some((voxel, excluded))
+        let value = if plain { stored } else { wire.affine.apply(stored) };
+        Some((Voxels::one(dtype, value), excluded))
     }
 
     /// As [`Assembler::put`], of a box of the fill value.

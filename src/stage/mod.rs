@@ -1,4 +1,4 @@
-//! What each stage is: parameters with units and ranges, channels, reach, tolerance, the paper it follows. Touches no voxel.
+//! What each stage is: its parameters as kernels and planner take them, and the directions of sweeps. Touches no voxel.
 
 pub mod directions;
 pub mod params;

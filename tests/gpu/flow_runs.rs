@@ -206,8 +206,8 @@ fn plans_say_what_runs_together_and_what_comes_back() {
     let alone = "[input.vol]\npath = \"vol.npy\"\n[stage.tf]\nop = \"transfer\"\ninput = \"vol\"\n\
                  points = [[0, 0, 0, 0, 0], [9, 1, 1, 1, 1]]\n[output.o]\npath = \"out/o.zarr\"\nfrom = \"tf.opacity\"\n";
     let plan = self::plan(dir.path(), alone, &[]);
-    assert!(plan.flows.is_empty() && plan.placement[0].1 == "cpu");
-    assert_eq!(plan.placement[0].2, occlude::plan::flows::ALONE);
+    assert!(plan.flows.is_empty() && plan.placement[0].lane == occlude::plan::Lane::Cpu);
+    assert_eq!(plan.placement[0].why, occlude::plan::flows::ALONE);
 }
 
 #[test]

@@ -286,7 +286,7 @@ fn placement_follows_the_device_and_says_why() {
     assert_eq!(place(&plan, "again"), ("gpu", "Test 9000"));
     assert!(staging > 0 && plan.groups[0].brick.parked - parked > staging, "device memory of software counts");
     let (plan, _) = plan_with("run.device='auto'", none()).unwrap();
-    assert!(plan.placement.iter().all(|p| p.1 == "cpu"));
+    assert!(plan.placement.iter().all(|p| p.lane == occlude::plan::Lane::Cpu));
     assert!(place(&plan, "stats").1.contains("no Vulkan adapter"));
     for device in ["gpu", "gpu:software"] {
         let error = plan_with(&format!("run.device='{device}'"), none()).unwrap_err();

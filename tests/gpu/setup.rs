@@ -68,8 +68,8 @@ pub fn plan(dir: &Path, text: &str, sets: &[&str]) -> Plan {
 
 /// Device and reason of a stage.
 pub fn place<'p>(plan: &'p Plan, stage: &str) -> (&'p str, &'p str) {
-    let found = plan.placement.iter().find(|p| p.0 == stage);
-    found.map(|p| (p.1, p.2.as_str())).unwrap_or_else(|| panic!("{stage} is placed"))
+    let found = plan.placement.iter().find(|p| p.name == stage);
+    found.map(|p| (p.lane.name(), p.why.as_str())).unwrap_or_else(|| panic!("{stage} is placed"))
 }
 
 /// The stages of each flow.
