@@ -223,7 +223,7 @@ fn second_phase(plan: &Plan) -> u64 {
         let output = &plan.outputs[o];
         let (parts, deepest) = (output.spec.components.unwrap_or(1), output.brick_level());
         let voxels = |k: usize| output.level(k).map_or(0, |l| l.shape.iter().product::<usize>());
-        let shared = (output.first_level()..=deepest).filter(|&k| output.is_zarr() && !output.owned(k, group));
+        let shared = (0..=deepest).filter(|&k| output.shared(k, group));
         let levels: usize = shared.map(|k| voxels(k) * parts * output.spec.dtype.size()).sum();
         let per_cell = if output.map.is_some() { 2 } else { parts * planes(output.reduce) };
         let beyond = if output.level_count() - 1 > deepest { deepest..output.level_count() } else { 0..0 };

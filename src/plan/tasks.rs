@@ -153,6 +153,11 @@ impl OutputPlan {
             && (0..3).all(|a| group.task[a] >= shape[a] || group.task[a].is_multiple_of(file[a] * level.factor[a]))
     }
 
+    /// Whether files of level `k`, which bricks make, belong to several tasks: its voxels wait in scratch for the second phase.
+    pub fn shared(&self, k: usize, group: &Group) -> bool {
+        self.is_zarr() && k >= self.first_level() && !self.owned(k, group)
+    }
+
     /// The box of level `k` (in its own cells, counted from the output's start) that a box of voxels makes.
     pub fn level_box(&self, k: usize, voxels: Region) -> Region {
         let level = self.level(k).expect("a level of the chain");

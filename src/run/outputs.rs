@@ -211,8 +211,7 @@ pub fn open_target(
     }
     let sink = Sink::create(spec, resume)?;
     let deepest = output.brick_level();
-    let shared = |k: usize| output.is_zarr() && k >= output.first_level() && !output.owned(k, group);
-    let two_phases = output.level_count() - 1 > deepest || (0..=deepest).any(shared);
+    let two_phases = output.level_count() - 1 > deepest || (0..=deepest).any(|k| output.shared(k, group));
     let dir = match two_phases {
         true => waiting::folder(&output.spec.path, scratch, begun)?,
         false => Sink::work_dir(&output.spec.path),
@@ -226,7 +225,7 @@ pub fn open_target(
     for k in 0..=deepest {
         let shape = output.level(k).expect("level exists").shape;
         let level = || open(format!("level.{k}"), shape, parts, output.spec.dtype.size());
-        levels.push(shared(k).then(level).transpose()?);
+        levels.push(output.shared(k, group).then(level).transpose()?);
     }
     let cells = (output.level_count() - 1 > deepest).then(|| {
         let per_cell = if output.map.is_some() { 2 } else { parts * planes(output.reduce) };

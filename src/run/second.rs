@@ -133,8 +133,8 @@ fn read_planes(spill: &Spill, planes: std::ops::Range<usize>, region: Region) ->
 }
 
 /// Cells below that are turned into cells at a time: a chunk has many, and made in one go they leave every cache and, of wide
-/// chunks, the budget, on one thread where a level has one chunk. 2-core Zen 4 VM, AVX-512, 2026-11-27: the end of a pyramid of 1024^3 voxels, of which 64^3 cells from
-/// 128^3 are most, takes 68 ms by slabs and 174 in one go (146 of them for these cells).
+/// chunks, the budget, on one thread where a level has one chunk. 2-core Zen 4 VM, AVX-512, 2026-11-27: the end of a pyramid of
+/// 1024^3 voxels, of which 64^3 cells from 128^3 are most, takes 68 ms by slabs and 174 in one go (146 of them for these cells).
 const AT_ONCE: usize = 1 << 15;
 
 /// One chunk, all components, of reduced cells.

@@ -101,7 +101,8 @@ impl Session<'_> {
         (0..self.sources.len()).map(by_input).collect()
     }
 
-    /// Ten times a second, between bricks: pages of mapped inputs behind the front are let go, the pool is kept small, progress is told.
+    /// Ten times a second, between bricks: pages of mapped inputs behind the front are let go, the pool is kept small, progress
+    /// is told.
     pub(super) fn tick(&self, brick: &BrickChoice, [voxels, of_voxels, bricks, of_bricks]: [u64; 4], phase: &str) {
         if self.is_due(bricks == of_bricks) {
             self.pool.trim((brick.bytes * brick.in_flight as u64 / 2) as usize);
