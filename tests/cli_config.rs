@@ -226,6 +226,7 @@ fn keys_of_other_stages_are_checked_too() {
         ("op = \"gaussian\"\ninput = \"ct\"", 3, "stage.s.sigma", "missing"),
         ("op = \"occlusion_map\"\ninput = \"ct\"\nstart_level = 2", 6, "stage.s.start_level", "0 to 1"),
         ("op = \"occlusion_map\"\ninput = \"ct\"\nborder = \"nearest\"", 6, "stage.s.border", "\"clip\""),
+        ("op = \"occlusion_map\"\ninput = \"ct\"\nfill = 3", 6, "stage.s.fill", "has no key"),
         ("op = \"obscurance\"\ninput = \"ct\"\ndirections = 13", 6, "stage.s.directions", "12, 42 or 162"),
         ("op = \"obscurance\"\ninput = \"ct\"\nborder = \"clip\"", 6, "stage.s.border", "op \"obscurance\" has no key"),
         ("op = \"obscurance\"\ninput = \"ct\"\nmax_distance = 0", 6, "stage.s.max_distance", "got 0"),

@@ -59,6 +59,34 @@ fn a_uniform_field_gives_itself_by_the_power_law() {
     assert!(worst < 0.03, "t^beta of uniform values is the value: off by {worst}");
 }
 
+/// A mirror repeats a plane of one voxel and nothing else: windows on it hold what windows in the middle of
+/// as many copies hold. (Fewer values than `levels` keeps, which takes quantiles of all voxels.)
+#[test]
+fn a_plane_under_mirrors_is_a_stack_of_itself() {
+    let plane = |_, y: usize, x: usize| (hash(5, (y * 40 + x) as u64) % 50) as f32;
+    for border in ["nearest", "reflect"] {
+        for (kind, stack) in [
+            ("op = 'box'\nradius = [3, 4, 2]", 7),
+            ("op = 'gaussian'\nsigma = [1, 2, 1]", 7),
+            ("op = 'ambient_occlusion'\nmethod = 'cdf_power'\nradius = 3", 7),
+            ("op = 'ambient_occlusion'\nmethod = 'exact'\nties = 'mid'\nradius = 3", 7),
+            ("op = 'ambient_occlusion'\nmethod = 'exact'\nradius = 2\nregion = 'ball'", 5),
+            ("op = 'ambient_occlusion'\nmethod = 'exact'\nradius = 5\nregion = 'equal_volume'", 9),
+            ("op = 'ambient_occlusion'\nmethod = 'levels'\nradius = 3", 7),
+        ] {
+            let body = format!("{kind}\nborder = '{border}'");
+            let one = stage(&Array3::from_shape_fn((1, 30, 40), |(z, y, x)| plane(z, y, x)), &body);
+            let many = stage(&Array3::from_shape_fn((stack, 30, 40), |(z, y, x)| plane(z, y, x)), &body);
+            for y in 0..30 {
+                for x in 0..40 {
+                    let (a, b) = (one[[0, y, x]], many[[stack / 2, y, x]]);
+                    assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0), "{body} at {y}, {x}: {a}, of copies {b}");
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn a_wall_dims_by_the_closed_form_of_each_rho() {
     // One dense plane h voxels above; directions that meet it within dmax contribute rho. Lattice lines round by half a

@@ -224,6 +224,57 @@ fn zarr_v2_codecs_of_numcodecs() {
     }
 }
 
+/// Version 3 with its axes stored in any order, among them one of channels inside the chunk; version 2 in Fortran's order.
+#[test]
+fn zarr_axes_stored_in_another_order() {
+    let shape = [2, 4, 5, 6];
+    let at = |i: [usize; 4]| ((i[0] * 1000 + i[1] * 100 + i[2] * 10 + i[3]) as u16).to_le_bytes();
+    for order in [[0, 1, 2, 3], [3, 2, 1, 0], [1, 0, 3, 2], [2, 3, 0, 1], [0, 3, 1, 2], [3, 0, 2, 1], [1, 2, 3, 0]] {
+        // Index along stored axis `i` is that along axis `order[i]`.
+        let mut stored = Vec::new();
+        let [a, b, c, d] = order.map(|axis: usize| shape[axis]);
+        for index in (0..a * b * c * d).map(|i| [i / (b * c * d), i / (c * d) % b, i / d % c, i % d]) {
+            let mut of = [0; 4];
+            order.iter().zip(index).for_each(|(&axis, i)| of[axis] = i);
+            stored.extend(at(of));
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let meta = json!({
+            "zarr_format": 3, "node_type": "array", "shape": shape, "data_type": "uint16", "fill_value": 0,
+            "dimension_names": ["c", "z", "y", "x"], "attributes": {},
+            "chunk_grid": { "name": "regular", "configuration": { "chunk_shape": shape } },
+            "chunk_key_encoding": { "name": "default", "configuration": { "separator": "/" } },
+            "codecs": [
+                { "name": "transpose", "configuration": { "order": order } },
+                { "name": "bytes", "configuration": { "endian": "little" } },
+                { "name": "gzip", "configuration": { "level": 1 } },
+            ],
+        });
+        fs::write(folder.path().join("zarr.json"), meta.to_string()).unwrap();
+        fs::create_dir_all(folder.path().join("c/0/0/0")).unwrap();
+        fs::write(folder.path().join("c/0/0/0/0"), gzip(&stored)).unwrap();
+        let old = tempfile::tempdir().unwrap();
+        if order == [3, 2, 1, 0] {
+            let meta = json!({
+                "zarr_format": 2, "shape": shape, "chunks": shape, "dtype": "<u2", "order": "F", "fill_value": 0,
+                "filters": null, "compressor": null,
+            });
+            fs::write(old.path().join(".zarray"), meta.to_string()).unwrap();
+            fs::write(old.path().join("0.0.0.0"), &stored).unwrap();
+        }
+        for folder in [&folder, &old].into_iter().filter(|f| f.path().read_dir().unwrap().next().is_some()) {
+            for channel in 0..2 {
+                let input = Input { channel: Select::Index(channel), ..file_input(folder.path()) };
+                let (_, voxels) = whole(&input, 0).unwrap();
+                for (i, [z, y, x]) in Region::whole([4, 5, 6]).iter().enumerate() {
+                    let want = u16::from_le_bytes(at([channel, z as usize, y as usize, x as usize]));
+                    assert_eq!(voxels.at(i), f64::from(want), "{order:?} channel {channel} at {z} {y} {x}");
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn nrrd_in_bzip2() {
     let folder = tempfile::tempdir().unwrap();

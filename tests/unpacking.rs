@@ -2,6 +2,7 @@
 //! memory is what a run can take.
 
 mod common;
+mod common_sources;
 
 use std::path::Path;
 
@@ -62,6 +63,43 @@ fn unpacking_changes_no_voxel() {
         of_stored(dir.path(), WINDOW, memory);
         let decoded = decode(&dir.path().join("o.zarr"));
         assert!(seen.replace(decoded.clone()).is_none_or(|s| s == decoded), "{chunk:?}, {memory}");
+    }
+}
+
+/// Only planes of the region and what its windows see are unpacked, however the volume is packed: what lies behind them may be broken.
+#[test]
+fn a_region_unpacks_its_own_planes() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = [40, 30, 20];
+    let bytes: Vec<u8> = (0..40 * 30 * 20).map(|i| hash(3, i) as u8).collect();
+    write_npy(&dir.path().join("v.npy"), "|u1", shape, &bytes);
+    let stages = "[stage.s]\nop = 'box'\ninput = 'v'\nradius = 2\n[output.o]\npath = 'o.npy'\nfrom = 's.max'\n";
+    let made = |input: &str, region: &str| {
+        let text = format!("[run]\nmemory = '64MiB'\n[input.v]\n{input}\n{stages}");
+        let config = parse(dir.path(), &text, &[&format!("run.region={region}")]);
+        let scratch = plan::explain(&config).unwrap().1["scratch_bytes"].as_u64().unwrap();
+        let options = occlude::run::RunOptions { overwrite: true, ..Default::default() };
+        let session = occlude::run::Session::open(&config, &options, &occlude::run::Silent)?;
+        session.run_tasks(&session.open_tasks())?;
+        session.finish()?;
+        Ok::<_, occlude::Error>((decode(&dir.path().join("o.npy")), scratch))
+    };
+    let region = "[[5, 9], [0, 30], [0, 20]]";
+    let (expected, none) = made("path = 'v.npy'", region).unwrap();
+    assert_eq!(none, 0);
+    // gzip, whose end is cut off.
+    let packed = common_sources::gzip(&bytes);
+    std::fs::write(dir.path().join("v.raw.gz"), &packed[..packed.len() - 100]).unwrap();
+    // Pages of one deflated strip each, of which that of plane 20 is broken.
+    let tiff = dir.path().join("v.tif");
+    common_sources::deflated_tiff(&tiff, shape, &bytes, Some(20));
+    let gz = "path = 'v.raw.gz'\nformat = 'raw'\nshape = [40, 30, 20]\ndtype = 'u8'";
+    for input in [gz, "path = 'v.tif'"] {
+        let (got, scratch) = made(input, region).unwrap();
+        assert_same(input, &got, &expected);
+        assert!((8 * 600..=11 * 600).contains(&scratch), "{input}: {scratch} bytes of scratch");
+        let error = made(input, "all").unwrap_err().to_string();
+        assert!(error.contains("v.raw.gz") || error.contains("v.tif"), "{error}");
     }
 }
 

@@ -39,6 +39,22 @@ pub fn copy<T: Voxel>(src: View<T>, src_box: Region, mut dst: ViewMut<T>, dst_bo
     }
 }
 
+/// Sets the common part of two boxes: `dst` covers `dst_box`; all of `src_box` has one stored value.
+pub fn fill_common(value: f64, src_box: Region, dst: AnyViewMut, dst_box: Region) {
+    fn run<T: Voxel>(mut dst: ViewMut<T>, at: [usize; 3], n: [usize; 3], value: T) {
+        for z in 0..n[0] {
+            for y in 0..n[1] {
+                dst.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + n[2]].fill(value);
+            }
+        }
+    }
+    let common = src_box.clip(&dst_box);
+    if !common.is_empty() {
+        let (at, n) = (dst_box.offset_of(&common), common.shape());
+        crate::with_view!(AnyViewMut, dst, v => run(v, at, n, Voxel::from_f64(value)));
+    }
+}
+
 /// Fills `dst` (covering `dst_box`, which may stick out of the volume) from `src` (covering `src_box`, which holds every
 /// voxel that the rule asks for). `volume` is the whole volume; `outside` the stored value for [`Border::Constant`].
 /// Panics for [`Border::Clip`] if `dst_box` sticks out.

@@ -1,14 +1,12 @@
 //! Working memory of one worker: grows to what the largest kernel asked for and is then reused.
 
-use crate::grid::Voxel;
-
 /// A grow-only, 64-byte-aligned arena. A kernel takes all that it needs in one call.
 #[derive(Default)]
 pub struct Scratch {
     words: Vec<Line>,
 }
 
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C, align(64))]
 struct Line([u8; 64]);
 
@@ -31,18 +29,16 @@ impl Scratch {
             ask_for_huge_pages(self.words.spare_capacity_mut());
             self.words.resize(lines, Line([0; 64]));
         }
-        // SAFETY: `Line` is 64 plain bytes without padding.
-        unsafe { std::slice::from_raw_parts_mut(self.words.as_mut_ptr().cast(), lines * 64) }
+        bytemuck::cast_slice_mut(&mut self.words[..lines])
     }
 }
 
 /// Cuts `len` elements of `T` off the front of a scratch slice, aligned to 64 bytes, and returns them with the rest.
 /// Panics if the slice is too short: ask [`Scratch::take`] for the sum of [`padded`] sizes.
-pub fn cut<T: Voxel>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
+pub fn cut<T: bytemuck::Pod>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
     let (head, tail) = bytes.split_at_mut(padded::<T>(len));
     assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
-    // SAFETY: aligned (just checked), long enough, and every bit pattern is a valid `Voxel`.
-    (unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }, tail)
+    (bytemuck::cast_slice_mut(&mut head[..len * size_of::<T>()]), tail)
 }
 
 /// Bytes that [`cut`] takes for `len` elements.

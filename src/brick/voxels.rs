@@ -105,19 +105,11 @@ impl Voxels {
 
     /// Bytes in this machine's order.
     pub fn as_bytes(&self) -> &[u8] {
-        fn bytes<T: Voxel>(v: &[T]) -> &[u8] {
-            // SAFETY: `Voxel` is implemented for primitive numbers only, which have no padding.
-            unsafe { std::slice::from_raw_parts(v.as_ptr().cast(), std::mem::size_of_val(v)) }
-        }
-        with_voxels!(self, v => bytes(v))
+        with_voxels!(self, v => bytemuck::cast_slice(v))
     }
 
     /// Bytes in this machine's order, for writing.
     pub fn as_bytes_mut(&mut self) -> &mut [u8] {
-        fn bytes<T: Voxel>(v: &mut [T]) -> &mut [u8] {
-            // SAFETY: as in `as_bytes`; every bit pattern is a valid `Voxel`.
-            unsafe { std::slice::from_raw_parts_mut(v.as_mut_ptr().cast(), std::mem::size_of_val(v)) }
-        }
-        with_voxels!(self, v => bytes(v))
+        with_voxels!(self, v => bytemuck::cast_slice_mut(v))
     }
 }

@@ -11,7 +11,7 @@ use super::args::RawArgs;
 use super::attributes::{self, Attributes};
 use super::progress::Count;
 use super::{messages, usage};
-use crate::brick::Voxels;
+use crate::brick::{Voxels, gather};
 use crate::config::{Input, InputKind, Place, RawFormat, Select};
 use crate::grid::{Affine, DType, Region, Shape, Voxel};
 use crate::run::Cancel;
@@ -322,31 +322,22 @@ pub fn read_box(volume: &Volume, component: usize, region: Region) -> Result<Vec
     let info = volume.info();
     let shape = region.shape();
     let mut values = vec![0.0; held(shape)?];
-    let to_value = ToValue { affine: volume.affine, nodata: info.nodata };
-    let Some(chunk) = info.chunk else {
-        let mut stored = Voxels::zeroed(info.dtype, values.len());
-        volume.source.read(component, region, stored.view_mut(shape))?;
-        with_voxels!(&stored, v => to_value.apply(v, &mut values));
-        return Ok(values);
-    };
-    for index in region.cells([0; 3], chunk).iter() {
-        let decoded = decode_chunk(&volume.source, component, index)?;
-        let cell = Region::of_cell(index, [0; 3], chunk);
-        let part = cell.clip(&region);
-        let (from, to) = (cell.offset_of(&part), region.offset_of(&part));
-        let [pz, py, px] = part.shape();
-        for (z, y) in (0..pz).flat_map(|z| (0..py).map(move |y| (z, y))) {
-            let at = ((to[0] + z) * shape[1] + to[1] + y) * shape[2] + to[2];
-            let target = &mut values[at..at + px];
-            match &decoded {
-                Chunk::Missing(value) => target.fill(to_value.one(*value)),
-                Chunk::Data(voxels) => {
-                    let start = ((from[0] + z) * chunk[1] + from[1] + y) * chunk[2] + from[2];
-                    with_voxels!(voxels, v => to_value.apply(&v[start..start + px], target));
+    let mut stored = Voxels::zeroed(info.dtype, values.len());
+    match info.chunk {
+        None => _ = volume.source.read(component, region, stored.view_mut(shape))?,
+        Some(chunk) => {
+            for index in region.cells([0; 3], chunk).iter() {
+                let cell = Region::of_cell(index, [0; 3], chunk);
+                let part = stored.view_mut(shape);
+                match decode_chunk(&volume.source, component, index)? {
+                    Chunk::Missing(value) => gather::fill_common(value, cell, part, region),
+                    Chunk::Data(voxels) => gather::copy_common(voxels.view(chunk), cell, part, region),
                 }
             }
         }
     }
+    let to_value = ToValue { affine: volume.affine, nodata: info.nodata };
+    with_voxels!(&stored, v => to_value.apply(v, &mut values));
     Ok(values)
 }
 

@@ -83,6 +83,20 @@ pub const SYNTHETIC: &[&str] = &["sphere", "plane", "gyroid", "noise", "ramp", "
 
 const NO_OPS: &[&str] = &[];
 const WINDOWED: &[&str] = &["box", "gaussian", "ambient_occlusion"];
+/// All but `occlusion_map`, whose levels pool every voxel.
+const MASKED: &[&str] = &[
+    "box",
+    "gaussian",
+    "ambient_occlusion",
+    "obscurance",
+    "transfer",
+    "window",
+    "opacity_modulation",
+    "gradient",
+    "saliency",
+    "ambient_light",
+    "combine",
+];
 const REGRESSION: &[&str] = &["gradient", "saliency"];
 const ONE_INPUT: &[&str] = &[
     "box",
@@ -155,8 +169,8 @@ pub const KEYS: &[Key] = &[
     stage(ONE_INPUT, "input", Kind::Ref, Required, "what it reads"),
     stage(&["combine"], "inputs", Kind::Refs, Required, "what it reads, all of one shape"),
     stage(&["combine"], "input", Kind::Refs, Absent("inputs is given"), "another name of `inputs`"),
-    stage(NO_OPS, "where", Kind::Where, Absent("everywhere"), "which voxels are needed"),
-    stage(NO_OPS, "fill", Kind::AnyNumber, Absent("1 for openness and its bounds, else 0"), "value of voxels that `where` excludes"),
+    stage(MASKED, "where", Kind::Where, Absent("everywhere"), "which voxels are needed"),
+    stage(MASKED, "fill", Kind::AnyNumber, Absent("1 for openness and its bounds, else 0"), "value of voxels that `where` excludes"),
     stage(WINDOWED, "border", Kind::Border, Toml("\"clip\""), "what a window sees beyond the edge of the volume; a constant is in scaled units"),
     stage(&["occlusion_map"], "border", Kind::Choice(&["clip"]), Toml("\"clip\""), "weights are renormalised at the edge"),
     stage(REGRESSION, "border", Kind::Choice(&["nearest"]), Toml("\"nearest\""), "the regression repeats the edge"),

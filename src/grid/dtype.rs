@@ -96,7 +96,7 @@ impl fmt::Display for DType {
 }
 
 /// A Rust type that a volume may hold. All bit patterns are valid values.
-pub trait Voxel: Copy + Default + PartialOrd + Send + Sync + fmt::Debug + 'static {
+pub trait Voxel: bytemuck::Pod + Default + PartialOrd + Send + Sync + fmt::Debug {
     const DTYPE: DType;
     fn to_f64(self) -> f64;
     /// Nearest value, ties to even, saturating; NaN gives 0 for integers.

@@ -89,7 +89,7 @@ impl Cells {
         [&self.value, &self.mark, &self.inner, &self.between].iter().map(|v| v.capacity() * size_of::<f64>()).sum()
     }
 
-    /// The cells, of any level, of a box in which every voxel has the finite value `v`, exactly as they are made from the voxels,
+    /// The cells, of any level, of a box in which every voxel has the value `v`, finite or NaN, exactly as they are made from the voxels,
     /// where all sums of `v` over a cell are exact; `excluded` by `where` or needed. Panics for Moments.
     pub fn uniform(&mut self, kind: Reduce, factor: [usize; 3], extent: Shape, v: f64, excluded: bool) {
         assert!(kind != Reduce::Moments, "moments of equal values are not made here");
@@ -97,7 +97,11 @@ impl Cells {
         let rows = self.shape[0] * self.shape[1];
         let n = self.shape[2];
         let mut value = std::mem::take(&mut self.value);
-        if kind == Reduce::Mean {
+        if kind == Reduce::Mean && v.is_nan() {
+            // No voxel counts.
+            value.fill(0.0);
+            self.mark.resize(rows * n, 0.0);
+        } else if kind == Reduce::Mean {
             for c in 0..rows {
                 self.implied([c / self.shape[1], c % self.shape[1]], &mut value[c * n..(c + 1) * n]);
             }

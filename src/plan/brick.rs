@@ -4,7 +4,7 @@ use super::Plan;
 use super::graph::Producer;
 use super::memory::{self, brick_bytes, slot_bytes};
 use super::parked::parked_bytes;
-use super::tasks::{Group, input_halo};
+use super::tasks::Group;
 use super::{streams, tasks};
 use crate::config::Config;
 use crate::gpu::facts;
@@ -186,7 +186,7 @@ fn layer_bytes(plan: &Plan, group: &Group) -> u64 {
         let wire = &plan.graph.wires[w];
         let Producer::Input(input) = wire.producer else { return 0 };
         let Some(chunk) = plan.input_chunks[input] else { return 0 };
-        let halo = input_halo(plan, group, w);
+        let halo = plan.graph.wires[w].halo;
         let across = |a: usize| {
             let edge = (group.task[a].min(region[a]) + 2 * halo[a]).min(group.shape[a]);
             edge.div_ceil(chunk[a]) + 1
@@ -214,7 +214,7 @@ fn decoded_again(plan: &Plan, group: &Group, choice: &BrickChoice) -> f64 {
 fn amplification(plan: &Plan, group: &Group, shape: Shape) -> f64 {
     let inputs = &group.inputs;
     let one = |w: usize| {
-        let halo = input_halo(plan, group, w);
+        let halo = plan.graph.wires[w].halo;
         (0..3).map(|a| seen_along(group, shape[a], halo[a], a)).product::<f64>()
     };
     let mean = inputs.iter().map(|&w| one(w)).sum::<f64>() / inputs.len().max(1) as f64;

@@ -4,7 +4,6 @@
 use std::collections::{BTreeSet, HashMap};
 
 use super::graph::{Producer, WireId};
-use super::tasks::input_halo;
 use super::{Group, Plan};
 use crate::grid::order::morton;
 use crate::grid::{Region, Shape};
@@ -65,7 +64,7 @@ fn chunked(plan: &Plan, group: &Group, w: WireId) -> Option<Chunked> {
     let chunk = plan.input_chunks[input]?;
     // Nobody knows how much of it a mask leaves: as if everything were needed.
     let bytes = (chunk.iter().product::<usize>() * wire.components * wire.dtype.size()) as u64;
-    let mut halo = input_halo(plan, group, w);
+    let mut halo = plan.graph.wires[w].halo;
     let swept = group.steps.iter().map(|&s| &plan.graph.steps[s]).filter(|s| s.streamed == Some(w));
     let mut passes = 1;
     for step in swept {

@@ -7,8 +7,8 @@ use serde_json::{Value, json};
 use super::brick::mib;
 use super::decodes;
 use super::graph::{Producer, Step, StepId};
+use super::memory::planes_read;
 use super::skips::{self, Known};
-use super::tasks::input_halo;
 use super::{FlowPlan, Group, Placed, Plan, flows};
 use crate::Result;
 use crate::config::Config;
@@ -28,6 +28,9 @@ pub fn explain(config: &Config) -> Result<(String, Value)> {
     while let Some(input) = decodes::worth_unpacking(&plan) {
         sources[input].unpack_first();
         plan = plan_of(&sources)?;
+    }
+    for (input, source) in sources.iter_mut().enumerate() {
+        source.narrow(planes_read(&plan, input));
     }
     let skips = plan.groups.iter().map(|g| skips::known(&plan, g, &sources)).collect::<Result<Vec<_>>>()?;
     Ok((text(config, &plan, &sources, &skips), describe(config, &plan, &sources, &skips)))
@@ -132,7 +135,7 @@ fn group_text(w: &mut String, plan: &Plan, group: &Group) {
         );
     }
     for &input in &group.inputs {
-        let _ = writeln!(w, "  halo of {}: {:?}", plan.graph.wires[input].name, input_halo(plan, group, input));
+        let _ = writeln!(w, "  halo of {}: {:?}", plan.graph.wires[input].name, plan.graph.wires[input].halo);
     }
 }
 
@@ -203,7 +206,7 @@ fn traffic(plan: &Plan, sources: &[Source]) -> (u64, u64) {
     for group in &plan.groups {
         for &w in &group.inputs {
             let Producer::Input(i) = plan.graph.wires[w].producer else { continue };
-            let halo = input_halo(plan, group, w);
+            let halo = plan.graph.wires[w].halo;
             let seen = group.region.grow(halo).clip(&Region::whole(group.shape)).voxels();
             let info = sources[i].info();
             asked[i] = asked[i].max((seen * info.components * info.dtype.size()) as u64);

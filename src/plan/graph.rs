@@ -43,7 +43,9 @@ pub struct Wire {
     pub fill: f64,
     /// The wire's lattice: index into [`Graph::lattices`].
     pub lattice: usize,
-    /// Voxels beyond the brick that consumers need.
+    /// Voxels beyond the brick that outputs need: an occlusion map makes its levels of them.
+    pub sink_halo: [usize; 3],
+    /// Voxels beyond the brick that consumers need, outputs among them.
     pub halo: [usize; 3],
 }
 
@@ -212,7 +214,7 @@ pub struct Graph {
 impl Graph {
     /// Demands halos from consumers to producers: a wire's halo is the largest of its consumers' plus their reach.
     pub fn demand_halos(&mut self) {
-        self.wires.iter_mut().for_each(|w| w.halo = [0; 3]);
+        self.wires.iter_mut().for_each(|w| w.halo = w.sink_halo);
         self.steps.iter_mut().for_each(|s| s.halo = [0; 3]);
         for s in (0..self.steps.len()).rev() {
             let outputs = self.steps[s].outputs.clone();

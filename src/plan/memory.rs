@@ -1,7 +1,9 @@
 //! Bytes by formula: what one brick of a given shape keeps alive at its worst moment, and what the run keeps besides.
 
+use std::ops::Range;
+
 use super::graph::{GradientChannel, Mask, Moment, Producer, Step, StepId, StepKind, WireId};
-use super::tasks::{Group, input_halo};
+use super::tasks::Group;
 use super::{OutputPlan, Plan, flows};
 use crate::config::WhereRule;
 use crate::gpu::flow::Flow;
@@ -29,7 +31,7 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
         voxels(size(halo)) * (wire.components * wire.dtype.size()) as u64
     };
     let mut live: Vec<(WireId, u64)> =
-        group.inputs.iter().map(|&w| (w, wire_bytes(w, input_halo(plan, group, w)))).collect();
+        group.inputs.iter().map(|&w| (w, wire_bytes(w, plan.graph.wires[w].halo))).collect();
     let mut peak = sum(&live);
     for (at, &s) in group.steps.iter().enumerate() {
         let of = |s: StepId| {
@@ -48,9 +50,7 @@ pub fn brick_bytes(plan: &Plan, group: &Group, shape: Shape) -> u64 {
         let last_use = |w: WireId| {
             group.sinks.contains(&w) || group.steps[at + 1..].iter().any(|&t| reads(&plan.graph.steps[t], w))
         };
-        let is_map =
-            |w: WireId| group.outputs.iter().any(|&o| plan.outputs[o].map.as_ref().is_some_and(|m| m.source == w));
-        live.retain(|(w, _)| last_use(*w) || is_map(*w));
+        live.retain(|(w, _)| last_use(*w));
     }
     let masks = mask_bytes(plan, group, shape);
     let sinks: u64 = group.outputs.iter().map(|&o| output_bytes(plan, group, &plan.outputs[o], shape)).sum();
@@ -292,7 +292,7 @@ fn output_bytes(plan: &Plan, group: &Group, output: &OutputPlan, brick: Shape) -
     let map = match &output.map {
         // Mean and variance of the grown brick or of blocks of it and the level below, and the passes between.
         Some(m) => {
-            let [nz, ny, nx] = grown(brick, input_halo(plan, group, m.source), group.shape).map(|n| n as u64);
+            let [nz, ny, nx] = grown(brick, plan.graph.wires[m.source].halo, group.shape).map(|n| n as u64);
             if m.by_blocks(output.brick_level()) {
                 let [z, y] = super::MAP_BLOCK.map(|n| 2 * n as u64 + 4);
                 let factor = m.chain.levels[1].factor.iter().map(|&f| f as u64).product::<u64>();
@@ -317,18 +317,30 @@ pub fn left_bytes(plan: &Plan, bricks: u64, parked: u64) -> u64 {
     plan.memory.saturating_sub(fixed + parked + bricks)
 }
 
+/// The part of an input's wire that a group reads at most.
+fn seen(plan: &Plan, group: &Group, w: WireId) -> Region {
+    let whole = Region::whole(group.shape);
+    let streamed = group.steps.iter().any(|&s| plan.graph.steps[s].streamed == Some(w));
+    // Pre-passes and columns of lines see more than the bricks' halos.
+    let all = streamed || !plan.prepasses.is_empty();
+    if all { whole } else { group.region.grow(plan.graph.wires[w].halo).clip(&whole) }
+}
+
+/// Planes of an input that a run reads at most; empty where it reads none.
+pub fn planes_read(plan: &Plan, input: usize) -> Range<usize> {
+    let wires = plan.groups.iter().flat_map(|g| g.inputs.iter().map(move |&w| (g, w)));
+    let of_input = wires.filter(|&(_, w)| plan.graph.wires[w].producer == Producer::Input(input));
+    let planes = of_input.map(|(g, w)| seen(plan, g, w)).map(|r| r.lo[0] as usize..r.hi[0] as usize);
+    planes.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
+}
+
 /// Bytes of all chunks that a group reads, decoded: a cache never holds more. 0 where its inputs have no chunks.
 pub fn decoded_bytes(plan: &Plan, group: &Group) -> u64 {
-    let whole = Region::whole(group.shape);
     let one = |&w: &WireId| {
         let wire = &plan.graph.wires[w];
         let Producer::Input(input) = wire.producer else { return 0 };
         let Some(chunk) = plan.input_chunks[input] else { return 0 };
-        let streamed = group.steps.iter().any(|&s| plan.graph.steps[s].streamed == Some(w));
-        // Pre-passes and columns of lines see more than the bricks' halos.
-        let all = streamed || !plan.prepasses.is_empty();
-        let seen = if all { whole } else { group.region.grow(input_halo(plan, group, w)).clip(&whole) };
-        let chunks = seen.cells([0; 3], chunk).voxels() as u64;
+        let chunks = seen(plan, group, w).cells([0; 3], chunk).voxels() as u64;
         chunks.saturating_mul((chunk.iter().product::<usize>() * wire.components * wire.dtype.size()) as u64)
     };
     group.inputs.iter().map(one).fold(0, u64::saturating_add)

@@ -5,7 +5,6 @@ use std::collections::HashMap;
 
 use super::graph::{Mask, Producer, StepId, WireId};
 use super::memory::wire_box;
-use super::tasks::input_halo;
 use super::{Group, Plan};
 use crate::Result;
 use crate::config::WhereRule;
@@ -70,7 +69,7 @@ impl Look<'_> {
         let Producer::Input(input) = self.plan.graph.wires[wire].producer else { return Ok(()) };
         let info = self.sources[input].info();
         let Some(chunk) = info.chunk else { return Ok(()) };
-        let region = wire_box(self.group.region, input_halo(self.plan, self.group, wire), self.group.shape);
+        let region = wire_box(self.group.region, self.plan.graph.wires[wire].halo, self.group.shape);
         let cells = region.cells([0; 3], chunk);
         if cells.voxels().saturating_mul(info.components) > LOOK_UPS {
             return Ok(());
@@ -136,7 +135,7 @@ impl Look<'_> {
         let needed = |s: StepId| graph.steps[s].mask.as_ref().map_or(Some(true), |m| self.needed(m, of_step(s)));
         let mut known = vec![false; graph.wires.len()];
         for &w in &self.group.inputs {
-            let halo = input_halo(self.plan, self.group, w);
+            let halo = graph.wires[w].halo;
             known[w] = self.constant(w, wire_box(brick, halo, self.group.shape)).is_some();
         }
         let mut read = vec![false; graph.wires.len()];
@@ -169,8 +168,6 @@ impl Look<'_> {
             }
             step.outputs.iter().for_each(|&w| known[w] = true);
         }
-        let maps = self.group.outputs.iter().filter_map(|&o| self.plan.outputs[o].map.as_ref());
-        let rest = self.group.sinks.iter().copied().chain(maps.map(|m| m.source));
-        rest.into_iter().all(|w| known[w]).then_some(masked)
+        self.group.sinks.iter().all(|&w| known[w]).then_some(masked)
     }
 }

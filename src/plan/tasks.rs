@@ -5,7 +5,7 @@
 //! run may change those.
 
 use super::graph::Graph;
-use super::graph::{StepId, WireId, add3, max3};
+use super::graph::{StepId, WireId, add3};
 use super::{BrickChoice, OutputPlan, Plan};
 use crate::config::OutputFormat;
 use crate::gpu::maps::{MapJob, MapLevel};
@@ -35,7 +35,7 @@ pub struct Group {
     pub region: Region,
     /// Indices into [`Plan::outputs`].
     pub outputs: Vec<usize>,
-    /// Wires whose values bricks deliver (outputs and the means beside them).
+    /// Wires whose values bricks deliver (outputs, the means beside them, what occlusion maps are made of).
     pub sinks: Vec<WireId>,
     pub steps: Vec<StepId>,
     /// Input wires that the steps and outputs read.
@@ -229,7 +229,8 @@ fn fill_group(plan: &Plan, group: &mut Group) {
     let outputs: Vec<&OutputPlan> = group.outputs.iter().map(|&o| &plan.outputs[o]).collect();
     for output in &outputs {
         let pooled = output.means.iter().flatten().copied().filter(|_| output.reduce == crate::stage::Reduce::Moments);
-        for w in output.parts.iter().map(|p| p.0).chain(pooled) {
+        let mapped = output.map.iter().map(|m| m.source);
+        for w in output.parts.iter().map(|p| p.0).chain(pooled).chain(mapped) {
             if !group.sinks.contains(&w) {
                 group.sinks.push(w);
             }
@@ -237,11 +238,6 @@ fn fill_group(plan: &Plan, group: &mut Group) {
     }
     group.steps = plan.steps_for(&group.sinks);
     group.inputs = inputs_of(plan, &group.steps, &group.sinks);
-    for map in outputs.iter().filter_map(|o| o.map.as_ref()) {
-        if !group.inputs.contains(&map.source) {
-            group.inputs.push(map.source);
-        }
-    }
     group.align = [1; 3];
     group.chunk = [1; 3];
     let mut files = [1; 3];
@@ -263,7 +259,7 @@ fn fill_group(plan: &Plan, group: &mut Group) {
     }
     // What sweeps see counts whether they read it as boxes or by columns, which the budget decides.
     let seen = group.steps.iter().map(|&s| &plan.graph.steps[s]).map(|s| add3(s.halo, s.reach));
-    let halo = group.inputs.iter().map(|&w| input_halo(plan, group, w)).chain(seen).flatten().max().unwrap_or(0);
+    let halo = group.inputs.iter().map(|&w| plan.graph.wires[w].halo).chain(seen).flatten().max().unwrap_or(0);
     group.task = choose_task(&outputs, base, shape, halo);
     group.tasks = std::array::from_fn(|a| shape[a].div_ceil(group.task[a]).max(1));
 }
@@ -335,19 +331,6 @@ pub fn inputs_of(plan: &Plan, steps: &[StepId], sinks: &[WireId]) -> Vec<WireId>
         }
     }
     inputs
-}
-
-/// Halo of a wire inside a group, with what its occlusion maps need of their source.
-pub fn input_halo(plan: &Plan, group: &Group, wire: WireId) -> [usize; 3] {
-    let mut halo = plan.graph.wires[wire].halo;
-    for &o in &group.outputs {
-        let output = &plan.outputs[o];
-        if let Some(map) = output.map.as_ref().filter(|m| m.source == wire) {
-            let deepest = map.chain.levels[output.brick_level()].factor;
-            halo = max3(halo, deepest.map(|f| 2 * (f - 1)));
-        }
-    }
-    halo
 }
 
 fn lcm3(a: Shape, b: Shape) -> Shape {

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::compute::Finished;
 use super::flows::Ready;
-use super::maps;
+use super::maps::Chain;
 use super::steps::MaskValue;
 use super::value::{Comp, Value};
 use crate::Result;
@@ -109,8 +109,9 @@ impl Assembler<'_> {
         let mut items = Vec::new();
         for &index in &self.group.outputs {
             let (output, Some(target)) = (&self.plan.outputs[index], &self.targets[index]) else { continue };
-            if output.map.is_some() {
-                maps::assemble(self, index, output, target, done, slot, scratch, &mut items)?;
+            if let Some(map) = &output.map {
+                let chain = Chain { assembler: self, index, output, map, target, done, slot };
+                chain.assemble(scratch, &mut items)?;
                 continue;
             }
             for (component, &(wire, comp)) in output.parts.iter().enumerate() {
@@ -175,7 +176,7 @@ impl Assembler<'_> {
         let k = place.output.brick_level();
         let region = place.output.level_box(k, brick);
         for (p, plane) in numbers.chunks_exact(region.voxels()).enumerate() {
-            spill.write(place.component * planes(place.output.reduce) + p, region, as_bytes(plane));
+            spill.write(place.component * planes(place.output.reduce) + p, region, bytemuck::cast_slice(plane));
         }
     }
 
@@ -275,7 +276,7 @@ impl Assembler<'_> {
     }
 
     /// Whether voxels of a level go to chunks that are encoded here.
-    fn in_chunks(&self, place: &Place, k: usize) -> bool {
+    pub(super) fn in_chunks(&self, place: &Place, k: usize) -> bool {
         place.output.is_zarr() && place.target.levels[k].is_none()
     }
 
@@ -413,10 +414,4 @@ impl Scaled<'_> {
             pool.put(voxels);
         }
     }
-}
-
-/// Numbers as bytes in this machine's order.
-pub fn as_bytes(numbers: &[f64]) -> &[u8] {
-    // SAFETY: f64 has no padding.
-    unsafe { std::slice::from_raw_parts(numbers.as_ptr().cast(), size_of_val(numbers)) }
 }

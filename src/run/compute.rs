@@ -6,7 +6,7 @@ use super::flows::Ready;
 use super::metrics::Since;
 use super::program::Program;
 use super::read::{Loaded, Reader};
-use super::steps::{Engine, MaskValue};
+use super::steps::{Engine, MaskValue, Piece};
 use super::trace::Trace;
 use super::value::Value;
 use crate::Result;
@@ -101,7 +101,8 @@ pub fn evaluate(reader: &Reader, loaded: Loaded, scratch: &mut Scratch, trace: &
         let outputs = if off.contains(&s) {
             engine.filled(step, region)
         } else {
-            engine.run(s, &mut values, known, region, volume, &fetch, scratch)?
+            let piece = Piece { id: s, step, mask: known, region, volume };
+            engine.run(piece, &mut values, &fetch, scratch)?
         };
         if matches!(known, MaskValue::None) {
             masked = true;

@@ -1,32 +1,25 @@
 //! Which device runs a step on a box, and the sweep, whose operands are narrowed first, on either.
 
-use super::steps::{Engine, Fetch, MaskValue, three, view_mut, views_mut};
+use super::steps::{Engine, Fetch, MaskValue, Piece, three, view_mut, views_mut};
 use super::value::{Value, common_value};
 use crate::brick::Scratch;
 use crate::gpu::{Gpu, GpuError};
 use crate::grid::{Affine, AnyView, AnyViewMut, DType, Region, View, Voxel};
 use crate::kernel::gradient::GradientOut;
 use crate::kernel::mask::Part;
-use crate::kernel::obscurance::{ObscuranceIo, Prepared};
+use crate::kernel::obscurance::ObscuranceIo;
 use crate::kernel::{Context, pointwise};
 use crate::plan::graph::{GradientChannel, ObscuranceChannel, Producer, Step, StepId, StepKind};
 use crate::{Error, Result};
 
 impl<'a> Engine<'a> {
-    #[allow(clippy::too_many_arguments)]
-    pub(super) fn sweep(
-        &self,
-        id: StepId,
-        sweep: &Prepared,
-        channels: &[ObscuranceChannel],
-        [has_colour, has_normal]: [bool; 2],
-        inputs: &[&Value],
-        outputs: &mut [Value],
-        mask: &MaskValue,
-        region: Region,
-        volume: Region,
-        cx: &mut Context,
-    ) -> Result<()> {
+    /// A sweep over its whole source.
+    pub(super) fn sweep(&self, piece: Piece, inputs: &[&Value], outputs: &mut [Value], cx: &mut Context) -> Result<()> {
+        let Piece { id, step, mask, region, volume } = piece;
+        let StepKind::Obscurance { sweep, channels, colour, normal } = &step.kind else {
+            unreachable!("only sweeps come here")
+        };
+        let (has_colour, has_normal) = (colour.is_some(), normal.is_some());
         let src_box = region.grow(sweep.reach()).clip(&volume);
         // Colours and normals of f64 data are narrowed: colours are weighted by f32 tables, of normals only the direction counts.
         let colour = has_colour.then(|| interleave([0, 1, 2].map(|c| inputs[1].view(c, src_box))));
@@ -74,18 +67,14 @@ impl<'a> Engine<'a> {
     }
 
     /// A sweep that reads the columns of its lines while it runs. A brick in which nothing can be occluded is a constant.
-    #[allow(clippy::too_many_arguments)]
     pub(super) fn sweep_streamed(
         &self,
-        id: StepId,
+        piece: Piece,
         inputs: &[&Value],
-        mask: &MaskValue,
-        region: Region,
-        volume: Region,
         fetch: &Fetch,
         scratch: &mut Scratch,
     ) -> Result<Vec<Value>> {
-        let step = &self.plan.graph.steps[id];
+        let Piece { id, step, mask, region, volume } = piece;
         let StepKind::Obscurance { sweep, .. } = &step.kind else { unreachable!("only sweeps are streamed") };
         let wire = &self.plan.graph.wires[step.outputs[0]];
         let mut openness = self.buffers(DType::F32, region, 1);

@@ -1,20 +1,20 @@
 //! Window kernels under a mask: run on boxes around what is needed, where those are cheaper than the whole brick. A result does
 //! not depend on the box that it is computed in, so only the time shows.
 
-use super::steps::{Engine, MaskValue, view_mut};
+use super::steps::{Engine, MaskValue, Piece, view_mut};
 use super::value::Value;
 use super::windowed::Windowed;
-use crate::grid::{AnyViewMut, DType, Region, View};
+use crate::grid::{AnyViewMut, DType, View};
 use crate::kernel::mask::{Cost, Part, Sight, boxes};
 use crate::kernel::rank;
-use crate::plan::graph::{Step, StepId, StepKind};
+use crate::plan::graph::{Step, StepKind};
 
 impl Engine<'_> {
     /// Boxes of a step's output to compute: all of it on the GPU, where every submission takes its time.
-    pub(super) fn parts(&self, id: StepId, mask: &MaskValue, src: &Windowed, region: Region) -> Vec<Part> {
+    pub(super) fn parts(&self, piece: Piece, src: &Windowed) -> Vec<Part> {
+        let Piece { id, step, mask, region, .. } = piece;
         match mask {
             MaskValue::Some(needed) if self.skip && !self.plan.on_gpu(id) => {
-                let step = &self.plan.graph.steps[id];
                 let sight = Sight { src: src.view().shape(), at: src.at, reach: step.reach };
                 boxes(&View::dense(needed, region.shape()), &sight, &cost(step, src.view().dtype()))
             }

@@ -4,7 +4,7 @@ use super::steps::MaskValue;
 use crate::grid::{Region, Shape};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
-use crate::plan::tasks::{Group, input_halo, inputs_of};
+use crate::plan::tasks::{Group, inputs_of};
 use crate::plan::{FlowPlan, Plan, Prepass};
 
 /// A pruned sub-graph for one stream of bricks.
@@ -25,15 +25,15 @@ pub struct Program {
 impl Program {
     /// The main stream of a group.
     pub fn of_group(plan: &Plan, group: &Group) -> Program {
-        let mut sinks = group.sinks.clone();
-        for map in group.outputs.iter().filter_map(|&o| plan.outputs[o].map.as_ref()) {
-            if !sinks.contains(&map.source) {
-                sinks.push(map.source);
-            }
+        let inputs = group.inputs.iter().map(|&w| (w, plan.graph.wires[w].halo)).collect();
+        Program {
+            steps: group.steps.clone(),
+            sinks: group.sinks.clone(),
+            inputs,
+            volume: group.shape,
+            outputs: group.outputs.clone(),
+            flows: plan.flows.clone(),
         }
-        let inputs = group.inputs.iter().map(|&w| (w, input_halo(plan, group, w))).collect();
-        let outputs = group.outputs.clone();
-        Program { steps: group.steps.clone(), sinks, inputs, volume: group.shape, outputs, flows: plan.flows.clone() }
     }
 
     /// The stream of a pre-pass over the whole volume.

@@ -12,7 +12,7 @@ use super::steps::{Engine, MaskValue};
 use super::value::{Comp, Value, common_value, copy_into};
 use crate::Result;
 use crate::brick::{Scratch, gather};
-use crate::grid::{AnyViewMut, Region, Voxel};
+use crate::grid::{AnyViewMut, Region};
 use crate::plan::graph::{Producer, StepId, WireId};
 use crate::plan::memory::wire_box;
 use crate::store::Source;
@@ -148,7 +148,7 @@ impl Reader<'_> {
                     let key = (input, 0, index);
                     let chunk_box = Region::of_cell(index, [0; 3], shape);
                     match self.cache.get(source, key, Future::UNKNOWN, self.engine.pool, self.metrics)? {
-                        Chunk::Missing(value) => fill_box(dst.reborrow(), region, chunk_box, value),
+                        Chunk::Missing(value) => gather::fill_common(value, chunk_box, dst.reborrow(), region),
                         Chunk::Decoded(voxels) => {
                             gather::copy_common(voxels.view(shape), chunk_box, dst.reborrow(), region);
                             stored = true;
@@ -211,7 +211,7 @@ impl Reader<'_> {
                 buffer
             });
             match chunk {
-                Chunk::Missing(value) => fill_box(dst.view_mut(region.shape()), region, chunk_box, value),
+                Chunk::Missing(value) => gather::fill_common(value, chunk_box, dst.view_mut(region.shape()), region),
                 Chunk::Decoded(voxels) => {
                     copy_into(voxels.view(shape), chunk_box, dst, region);
                     // The cache let go of it, and no other brick holds it: the next chunk takes its place, still warm.
@@ -227,21 +227,4 @@ impl Reader<'_> {
             (None, None) => unreachable!("a brick's box is not empty"),
         })
     }
-}
-
-/// Sets the part of a dense buffer over `region` that `part` covers.
-fn fill_box(dst: AnyViewMut, region: Region, part: Region, value: f64) {
-    fn run<T: Voxel>(mut v: crate::grid::ViewMut<T>, region: Region, part: Region, value: f64) {
-        let common = part.clip(&region);
-        if common.is_empty() {
-            return;
-        }
-        let (at, n) = (region.offset_of(&common), common.shape());
-        for z in 0..n[0] {
-            for y in 0..n[1] {
-                v.row_at(at[0] + z, at[1] + y)[at[2]..at[2] + n[2]].fill(T::from_f64(value));
-            }
-        }
-    }
-    crate::with_view!(AnyViewMut, dst, v => run(v, region, part, value));
 }

@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use super::assemble::{Target, as_bytes};
+use super::assemble::Target;
 use crate::Result;
 use crate::brick::{Scratch, Voxels};
 use crate::grid::{AnyView, DType, Region, View};
@@ -215,7 +215,7 @@ fn cells_slab(
     stored.clear();
     cells.store(stored);
     for (p, plane) in stored.chunks_exact(slab.voxels()).enumerate() {
-        next.write(first + p, slab, as_bytes(plane));
+        next.write(first + p, slab, bytemuck::cast_slice(plane));
     }
     rounded
 }
@@ -251,7 +251,7 @@ fn map_chunk(
             convert_at(Level::detect(), view, output.mapping(component, target.range), part);
         }
         for (plane, values) in [&made.mean, &made.variance].into_iter().enumerate() {
-            next.write(plane, slab, as_bytes(values));
+            next.write(plane, slab, bytemuck::cast_slice(values));
         }
     }
     let mut bytes = 0;

@@ -17,7 +17,7 @@ use super::outputs::{self, Start};
 use super::program::Program;
 use super::report::{self, Report};
 use super::steps::Engine;
-use super::stream::Work;
+use super::stream::{Stations, Work};
 use super::trace::Trace;
 use super::unpack::unpack;
 use super::{planned, second, windows};
@@ -107,7 +107,7 @@ impl<'a> Session<'a> {
         if options.overwrite {
             // Before the old result goes: a broken input must not cost it.
             outputs::refuse_foreigners(config, &plan)?;
-            unpack(&mut sources, config, options, progress, &metrics)?;
+            unpack(&mut sources, &plan, config, options, progress, &metrics)?;
         }
         let start = outputs::start(config, &plan, &header, options.resume, options.overwrite)?;
         if start != Start::Complete {
@@ -166,7 +166,7 @@ impl<'a> Session<'a> {
         };
         let open = !self.done.iter().all(is_done) || self.globals.len() < self.plan.prepasses.len();
         if open && !self.options.overwrite {
-            unpack(&mut self.sources, self.config, self.options, self.progress, &self.metrics)?;
+            unpack(&mut self.sources, &self.plan, self.config, self.options, self.progress, &self.metrics)?;
         }
         for id in self.globals.len()..self.plan.prepasses.len() {
             let found = self.prepass(id)?;
@@ -300,7 +300,8 @@ impl<'a> Session<'a> {
         // From here the rate counts.
         let (bricks, voxels) = self.metrics.done();
         self.progress.update(voxels, self.plan.voxels(), bricks, total, "compute");
-        let streamed = self.stream(&engine, &program, &group.brick, &work, &self.metrics, &deliver, &write, &tick);
+        let stations = Stations { deliver: &deliver, write: &write, tick: &tick };
+        let streamed = self.stream(&engine, &program, &group.brick, &work, &self.metrics, &stations);
         // What was finished is kept, whatever ended the stream; the first error is the one to tell.
         streamed.and(commits.settle(commit))
     }

@@ -48,6 +48,17 @@ pub enum MaskValue {
     Some(Arc<Vec<u8>>),
 }
 
+/// A step and the box of its output that is to be made.
+#[derive(Clone, Copy)]
+pub struct Piece<'p> {
+    pub id: StepId,
+    pub step: &'p Step,
+    pub mask: &'p MaskValue,
+    pub region: Region,
+    /// All of the lattice: windows end there, or are continued by the border rule.
+    pub volume: Region,
+}
+
 impl<'a> Engine<'a> {
     pub fn new(plan: &'a Plan, pool: &'a Pool, gpu: Option<&'a Gpu>, metrics: &'a Metrics, skip: bool) -> Engine<'a> {
         Engine { plan, level: Level::detect(), globals: Vec::new(), skip, pool, gpu, metrics }
@@ -106,29 +117,25 @@ impl<'a> Engine<'a> {
         wires.map(|w| Value::constant(w.dtype, region, w.components, w.fill)).collect()
     }
 
-    /// Computes a step on `region`; `values` holds its inputs, each covering what it needs but for what `fetch` reads.
+    /// Computes a piece; `values` holds the step's inputs, each covering what it needs but for what `fetch` reads.
     ///
     /// # Errors
     /// A GPU that failed twice, or an input that could not be read.
-    #[allow(clippy::too_many_arguments)]
     pub fn run(
         &self,
-        id: StepId,
+        piece: Piece,
         values: &mut [Option<Value>],
-        mask: &MaskValue,
-        region: Region,
-        volume: Region,
         fetch: &Fetch,
         scratch: &mut Scratch,
     ) -> Result<Vec<Value>> {
-        let step = &self.plan.graph.steps[id];
+        let Piece { step, mask, region, .. } = piece;
         if let MaskValue::None = mask {
             return Ok(self.filled(step, region));
         }
         if self.skip
             && matches!(mask, MaskValue::All)
             && step.streamed.is_none()
-            && let Some(values) = self.constant(id, &inputs_of(step, values), region, volume, scratch)?
+            && let Some(values) = self.constant(piece, &inputs_of(step, values), scratch)?
         {
             return Ok(values);
         }
@@ -138,9 +145,9 @@ impl<'a> Engine<'a> {
             }
         }
         let mut outputs = if step.streamed.is_some() {
-            self.sweep_streamed(id, &inputs_of(step, values), mask, region, volume, fetch, scratch)?
+            self.sweep_streamed(piece, &inputs_of(step, values), fetch, scratch)?
         } else {
-            self.compute(id, &inputs_of(step, values), mask, region, volume, step.border, scratch)?
+            self.compute(piece, step.border, &inputs_of(step, values), scratch)?
         };
         if let MaskValue::Some(needed) = mask {
             for (value, &w) in outputs.iter_mut().zip(&step.outputs) {
@@ -152,15 +159,8 @@ impl<'a> Engine<'a> {
     }
 
     /// A step of constants is the same step on one voxel: the kernel itself says what comes out.
-    fn constant(
-        &self,
-        id: StepId,
-        inputs: &[&Value],
-        region: Region,
-        volume: Region,
-        scratch: &mut Scratch,
-    ) -> Result<Option<Vec<Value>>> {
-        let step = &self.plan.graph.steps[id];
+    fn constant(&self, piece: Piece, inputs: &[&Value], scratch: &mut Scratch) -> Result<Option<Vec<Value>>> {
+        let Piece { step, region, volume, .. } = piece;
         let Some(constants) = inputs.iter().map(|v| v.constants()).collect::<Option<Vec<_>>>() else { return Ok(None) };
         if matches!(step.border, Border::Constant(_)) && !volume.contains(&region.grow(step.reach)) {
             return Ok(None);
@@ -177,7 +177,8 @@ impl<'a> Engine<'a> {
         // Its windows end inside the volume: around the one voxel lies its own value, not the border's.
         let border = if matches!(step.border, Border::Constant(_)) { Border::Nearest } else { step.border };
         let small: Vec<&Value> = small.iter().collect();
-        let outputs = self.compute(id, &small, &MaskValue::All, one, one, border, scratch)?;
+        let voxel = Piece { mask: &MaskValue::All, region: one, volume: one, ..piece };
+        let outputs = self.compute(voxel, border, &small, scratch)?;
         let spread = |value: Value| {
             let comps = value.comps.iter().map(|c| match c {
                 Comp::Const(v) => Comp::Const(*v),
@@ -189,42 +190,19 @@ impl<'a> Engine<'a> {
     }
 
     /// `border` is the step's, or what stands for it around a constant.
-    #[allow(clippy::too_many_arguments)]
-    fn compute(
-        &self,
-        id: StepId,
-        inputs: &[&Value],
-        mask: &MaskValue,
-        region: Region,
-        volume: Region,
-        border: Border,
-        scratch: &mut Scratch,
-    ) -> Result<Vec<Value>> {
-        let step = &self.plan.graph.steps[id];
+    fn compute(&self, piece: Piece, border: Border, inputs: &[&Value], scratch: &mut Scratch) -> Result<Vec<Value>> {
+        let Piece { id, step, region, .. } = piece;
         let wires: Vec<&Wire> = step.outputs.iter().map(|&w| &self.plan.graph.wires[w]).collect();
         let mut outputs: Vec<Value> = wires.iter().map(|w| self.buffers(w.dtype, region, w.components)).collect();
         let mut cx = Context { level: self.level, scratch };
         let input_wire = &self.plan.graph.wires[step.inputs[0]];
         match &step.kind {
-            StepKind::Obscurance { sweep, channels, colour, normal } => {
-                self.sweep(
-                    id,
-                    sweep,
-                    channels,
-                    [colour.is_some(), normal.is_some()],
-                    inputs,
-                    &mut outputs,
-                    mask,
-                    region,
-                    volume,
-                    &mut cx,
-                )?;
-            }
+            StepKind::Obscurance { .. } => self.sweep(piece, inputs, &mut outputs, &mut cx)?,
             StepKind::Gradient { size, weight, spacing, channels, stored } => {
-                let whole = self.windowed(step, border, inputs[0], 0, input_wire, region, volume);
+                let whole = self.windowed(piece, border, inputs[0], 0);
                 let affine = if *stored { Affine::IDENTITY } else { whole.affine };
                 let fit = Fit { size: *size, weight: *weight, spacing: *spacing, missing: whole.missing };
-                for part in self.parts(id, mask, &whole, region) {
+                for part in self.parts(piece, &whole) {
                     let src = whole.part(&part, step.reach);
                     let out = gradient_out(channels, &mut outputs, &part);
                     match self.lane(id, region) {
@@ -256,8 +234,8 @@ impl<'a> Engine<'a> {
             | StepKind::Moments4 { .. }
             | StepKind::Gaussian { .. } => {
                 for c in 0..input_wire.components {
-                    let src = self.windowed(step, border, inputs[0], c, input_wire, region, volume);
-                    for part in self.parts(id, mask, &src, region) {
+                    let src = self.windowed(piece, border, inputs[0], c);
+                    for part in self.parts(piece, &src) {
                         let outs = views_of(&mut outputs, c, &part);
                         self.windows(id, &src.part(&part, step.reach), outs, region, &mut cx)?;
                     }

@@ -3,7 +3,9 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::RecvTimeoutError;
 
 use super::budget::{Budget, Permit};
 use super::cancel::Cancel;
@@ -15,11 +17,24 @@ use crate::brick::Scratch;
 use crate::grid::Region;
 use crate::{Error, Result};
 
+/// Between two looks at the memory that is held; each takes 10 us.
+const SAMPLED_EVERY: Duration = Duration::from_millis(10);
+
 /// One brick to do: its box and the caller's number for it (a task slot).
 #[derive(Debug, Clone, Copy)]
 pub struct Work {
     pub brick: Region,
     pub slot: usize,
+}
+
+/// What becomes of the bricks of a stream.
+pub struct Stations<'a, W> {
+    /// Turns a finished brick into what is to be written (called on workers).
+    pub deliver: &'a (dyn Fn(&Finished, Work, &mut Scratch) -> Result<W> + Sync),
+    /// Writes it (called on writers).
+    pub write: &'a (dyn Fn(Work, W) -> Result<()> + Sync),
+    /// Told after each brick.
+    pub tick: &'a (dyn Fn() + Sync),
 }
 
 /// What a stream of bricks needs.
@@ -35,12 +50,7 @@ pub struct Stream<'a, W> {
     pub metrics: &'a Metrics,
     pub trace: &'a Trace,
     pub cancel: &'a Cancel,
-    /// Turns a finished brick into what is to be written (called on workers).
-    pub deliver: &'a (dyn Fn(&Finished, Work, &mut Scratch) -> Result<W> + Sync),
-    /// Writes it (called on writers).
-    pub write: &'a (dyn Fn(Work, W) -> Result<()> + Sync),
-    /// Told after each brick.
-    pub tick: &'a (dyn Fn() + Sync),
+    pub stations: &'a Stations<'a, W>,
 }
 
 /// The first error; later ones are consequences.
@@ -91,6 +101,13 @@ impl<W: Send> Stream<'_, W> {
                 scope.spawn(|| self.write_loop(&first, finished));
             }
             drop((to_compute, finished));
+            // Until its channel closes, whatever ends the work: a large chunk is decoded between two bricks.
+            let (working, done) = crossbeam_channel::bounded::<()>(0);
+            scope.spawn(move || {
+                while done.recv_timeout(SAMPLED_EVERY) == Err(RecvTimeoutError::Timeout) {
+                    self.metrics.sample_memory();
+                }
+            });
             let (first, scratches, to_write) = (&first, &of_workers, to_write);
             self.pool.in_place_scope(|workers| {
                 for (work, loaded, permit) in ready {
@@ -98,6 +115,7 @@ impl<W: Send> Stream<'_, W> {
                     workers.spawn(move |_| self.compute(work, loaded, permit, first, scratches, &to_write));
                 }
             });
+            drop(working);
         });
         match first.error.into_inner().unwrap_or_else(|e| e.into_inner()) {
             Some(error) => Err(error),
@@ -167,7 +185,7 @@ impl<W: Send> Stream<'_, W> {
             let engine = self.reader.engine;
             let done = evaluate(self.reader, loaded, &mut scratch, self.trace)?;
             let start = Instant::now();
-            let written = (self.deliver)(&done, work, &mut scratch);
+            let written = (self.stations.deliver)(&done, work, &mut scratch);
             self.metrics.encode_ns.fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);
             // The brick and what became of it: the most that it holds.
             self.metrics.sample_memory();
@@ -196,14 +214,14 @@ impl<W: Send> Stream<'_, W> {
                 continue;
             }
             let start = Instant::now();
-            match guarded(|| (self.write)(work, written)) {
+            match guarded(|| (self.stations.write)(work, written)) {
                 Ok(()) => self.metrics.brick_done(work.brick.voxels() as u64),
                 Err(error) => first.set(error),
             }
             self.trace.span("write", start, &[("brick", format!("{:?}", work.brick))]);
             drop(permit);
             self.metrics.sample_memory();
-            (self.tick)();
+            (self.stations.tick)();
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Bricks of one value that is the output's fill value in every level: their chunks are not stored, so no voxel is made for them.
+//! Bricks of one value in every level: chunks of the output's fill value are not stored, others are all the same, so no voxel is made
+//! for them.
 
 use super::assemble::{Assembler, Item, Place};
 use super::compute::Finished;
@@ -12,10 +13,10 @@ use crate::kernel::convert::convert_at;
 use crate::kernel::reduce::Cells;
 use crate::plan::graph::{Producer, WireId};
 use crate::stage::Reduce;
-use crate::store::sink::Encoded;
+use crate::store::sink::{Encoded, fill_bytes};
 
 impl Assembler<'_> {
-    /// Delivers a component whose voxels all become the fill value; false, and nothing is done, for any other.
+    /// Delivers a component whose voxels, and the cells of its levels, all become one; false, and nothing is done, for any other.
     pub(super) fn uniform(
         &self,
         place: &Place,
@@ -27,10 +28,10 @@ impl Assembler<'_> {
     ) -> Result<bool> {
         let (output, spec) = (place.output, place.target.sink.spec());
         let Some((value, excluded)) = self.only_value(wire, comp, done) else { return Ok(false) };
-        let fill = Voxels::one(spec.dtype, spec.fill);
         // Moments of equal values may not be 0, and sums of f64 may round.
         let one = value.at(0);
-        if !output.is_zarr() || output.reduce == Reduce::Moments || value.dtype() == DType::F64 || !one.is_finite() {
+        let rounds = value.dtype() == DType::F64 && one != 0.0 && !one.is_nan();
+        if !output.is_zarr() || output.reduce == Reduce::Moments || rounds || one.is_infinite() {
             return Ok(false);
         }
         let mut cx = Context { level: self.level, scratch };
@@ -39,11 +40,11 @@ impl Assembler<'_> {
         let mut coarse = code.clone();
         cells.uniform(output.reduce, [1; 3], [1; 3], one, excluded);
         cells.write([0; 3], self.mapping(place), coarse.view_mut([1; 3]), &mut cx);
-        if [&code, &coarse].iter().any(|v| v.as_bytes() != fill.as_bytes()) {
+        if fill_bytes(spec.dtype, code.at(0)) != fill_bytes(spec.dtype, coarse.at(0)) {
             return Ok(false);
         }
         for k in 0..=output.brick_level() {
-            self.put_fill(place, k, output.level_box(k, done.brick), spec.fill, items)?;
+            self.put_uniform(place, k, output.level_box(k, done.brick), &code, items)?;
         }
         if place.target.cells.is_some() {
             let deepest = output.level(output.brick_level()).expect("level exists");
@@ -77,13 +78,13 @@ impl Assembler<'_> {
         Some((Voxels::one(dtype, value), excluded))
     }
 
-    /// As [`Assembler::put`], of a box of the fill value.
-    pub(super) fn put_fill(
+    /// As [`Assembler::put`], of a box of one voxel of the output's type.
+    pub(super) fn put_uniform(
         &self,
         place: &Place,
         k: usize,
         region: Region,
-        fill: f64,
+        voxel: &Voxels,
         items: &mut Vec<Item>,
     ) -> Result<()> {
         let (output, sink) = (place.output, &place.target.sink);
@@ -92,25 +93,33 @@ impl Assembler<'_> {
         let mut push = |region: Region, chunk: Encoded| {
             items.push(Item { output: place.index, dataset, component: place.component, region, chunk });
         };
-        // Made only for chunks that wait for the rest, which other bricks have.
+        // Made only for chunks at the volume's end and for those that wait for the rest, which other bricks have.
         let mut filled = None;
         let mut voxels = || {
             let mut buffer = self.pool.take(output.spec.dtype, region.voxels());
-            buffer.fill(fill);
+            buffer.fill(voxel.at(0));
             buffer
         };
-        if let Some(spill) = &place.target.levels[k] {
-            spill.write(place.component, region, filled.get_or_insert_with(voxels).as_bytes());
+        if !self.in_chunks(place, k) {
+            let view = filled.get_or_insert_with(voxels).view(region.shape());
+            self.put(place, k, region, view, items)?;
         } else {
+            let empty = sink.encode_uniform(voxel)? == Encoded::Empty;
             for index in region.cells([0; 3], output.spec.chunk).iter() {
-                let chunk = Region::of_cell(index, [0; 3], output.spec.chunk).clip(&whole);
-                if region.contains(&chunk) {
-                    push(chunk, Encoded::Empty);
+                let cell = Region::of_cell(index, [0; 3], output.spec.chunk);
+                let chunk = cell.clip(&whole);
+                if region.contains(&cell) || empty && region.contains(&chunk) {
+                    push(chunk, sink.encode_uniform(voxel)?);
                     continue;
                 }
+                let part = chunk.clip(&region);
                 let view = filled.get_or_insert_with(&mut voxels).view(region.shape());
-                let key = (place.index, k, place.component, index);
-                if let Some(full) = self.park(place, key, chunk, region, view) {
+                let piece = view.part(region.offset_of(&part), part.shape());
+                if part == chunk {
+                    push(chunk, sink.encode(dataset, chunk, piece)?);
+                } else if let Some(full) =
+                    self.park(place, (place.index, k, place.component, index), chunk, part, piece)
+                {
                     push(chunk, sink.encode(dataset, chunk, full.view(chunk.shape()))?);
                     self.pool.put(full);
                 }

@@ -5,23 +5,29 @@ use std::path::PathBuf;
 use super::metrics::Metrics;
 use super::options::{Progress, RunOptions};
 use crate::config::Config;
+use crate::plan::Plan;
+use crate::plan::memory::planes_read;
 use crate::store::{Source, said_of};
 use crate::{Error, Result};
 
 /// Inputs that unpack to less than this are unpacked before anybody would read a line about it.
 const QUIET: u64 = 64 << 20;
 
-/// Makes every source ready to be read.
+/// Makes of every source what the plan reads ready to be read.
 ///
 /// # Errors
 /// A file is broken, scratch has no room, or somebody asked to stop.
 pub fn unpack(
     sources: &mut [Source],
+    plan: &Plan,
     config: &Config,
     options: &RunOptions,
     progress: &dyn Progress,
     metrics: &Metrics,
 ) -> Result<()> {
+    for (input, source) in sources.iter_mut().enumerate() {
+        source.narrow(planes_read(plan, input));
+    }
     let total: u64 = sources.iter().map(Source::spool_bytes).sum();
     let beside = config.outputs[0].path.parent().map_or_else(|| PathBuf::from("."), PathBuf::from);
     let folder = config.run.scratch.clone().unwrap_or(beside);

@@ -1,12 +1,11 @@
 //! What windows see: a step's input grown by its reach, clipped to the volume or extended by the border rule.
 
-use super::steps::Engine;
+use super::steps::{Engine, Piece};
 use super::value::Value;
 use crate::brick::{Pool, Voxels, gather};
 use crate::grid::{Affine, AnyView, AnyViewMut, Border, Region, Shape, Voxel};
 use crate::kernel::mask::{Part, Sight};
 use crate::kernel::pointwise;
-use crate::plan::graph::{Step, Wire};
 
 /// A kernel's input with the place of the output box in it.
 pub(super) struct Windowed<'a> {
@@ -52,17 +51,10 @@ impl Windowed<'_> {
 impl Engine<'_> {
     /// The input of a window kernel: the box grown by the reach, clipped or extended by the border rule. Where the step's
     /// border makes floats of the voxels it does so everywhere, so that a brick at the edge has the bits of one inside.
-    #[allow(clippy::too_many_arguments)]
-    pub(super) fn windowed<'v>(
-        &self,
-        step: &Step,
-        border: Border,
-        value: &'v Value,
-        comp: usize,
-        wire: &Wire,
-        region: Region,
-        volume: Region,
-    ) -> Windowed<'v> {
+    /// `border` is the step's, or what stands for it around a constant.
+    pub(super) fn windowed<'v>(&self, piece: Piece, border: Border, value: &'v Value, comp: usize) -> Windowed<'v> {
+        let Piece { step, region, volume, .. } = piece;
+        let wire = &self.plan.graph.wires[step.inputs[0]];
         let wanted = region.grow(step.reach);
         let inside = wanted.clip(&volume);
         let whole = Windowed {

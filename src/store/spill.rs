@@ -3,6 +3,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU8, AtomicU16, AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use memmap2::MmapRaw;
 
@@ -30,6 +31,49 @@ fn reserve(file: &File, path: &Path, bytes: u64) -> std::io::Result<()> {
 fn file_bytes(path: &Path, shape: Shape, planes: usize, item: usize) -> Result<u64> {
     let bytes = shape.iter().try_fold(planes * item, |n, &s| n.checked_mul(s));
     bytes.map(|n| n.max(1) as u64).ok_or_else(|| Error::file(path, "the scratch array is too large"))
+}
+
+/// What a mapping is read and written in: tasks share an array, and nothing but atomics may be shared that is written.
+trait Word {
+    fn put(&self, bytes: &[u8]);
+    fn get(&self, bytes: &mut [u8]);
+}
+macro_rules! word {
+    ($($atomic:ty: $plain:ty),*) => {$(
+        impl Word for $atomic {
+            fn put(&self, bytes: &[u8]) {
+                self.store(<$plain>::from_ne_bytes(bytes.try_into().expect("one word")), Relaxed);
+            }
+            fn get(&self, bytes: &mut [u8]) {
+                bytes.copy_from_slice(&self.load(Relaxed).to_ne_bytes());
+            }
+        }
+    )*};
+}
+word!(AtomicU8: u8, AtomicU16: u16, AtomicU32: u32, AtomicU64: u64);
+
+/// Does the same with a part of a mapping in words of the item's size.
+macro_rules! with_words {
+    ($spill:expr, $offset:expr, $bytes:expr, $words:ident => $do:expr) => {
+        match $spill.word() {
+            8 => {
+                let $words = $spill.words::<AtomicU64>($offset, $bytes);
+                $do
+            }
+            4 => {
+                let $words = $spill.words::<AtomicU32>($offset, $bytes);
+                $do
+            }
+            2 => {
+                let $words = $spill.words::<AtomicU16>($offset, $bytes);
+                $do
+            }
+            _ => {
+                let $words = $spill.words::<AtomicU8>($offset, $bytes);
+                $do
+            }
+        }
+    };
 }
 
 /// `planes` dense arrays of one shape and item size, one after the other, in a file.
@@ -78,28 +122,38 @@ impl Spill {
         Ok(Spill { path: path.to_path_buf(), file, map, shape, planes, item })
     }
 
-    /// Writes the voxels of `region` of one plane; `bytes` are dense. Boxes written at the same time must be disjoint.
-    /// Panics if extents disagree.
+    /// Writes the voxels of `region` of one plane; `bytes` are dense. Panics if extents disagree.
     pub fn write(&self, plane: usize, region: Region, bytes: &[u8]) {
         assert_eq!(bytes.len(), region.voxels() * self.item);
         let row = region.shape()[2] * self.item;
         for (i, offset) in self.rows(plane, region).enumerate() {
-            // SAFETY: the row lies inside the mapping (checked in `rows`), the mapping lives as long as `self`, and callers
-            // write disjoint boxes, so no other thread touches these bytes.
-            unsafe {
-                std::ptr::copy_nonoverlapping(bytes[i * row..].as_ptr(), self.map.as_mut_ptr().add(offset), row);
-            }
+            let from = &bytes[i * row..][..row];
+            with_words!(self, offset, row, words => words.iter().zip(from.chunks_exact(self.word())).for_each(|(w, b)| w.put(b)));
         }
     }
 
-    /// Reads the voxels of `region` of one plane into `out`, dense. Nobody may write that box meanwhile.
+    /// Reads the voxels of `region` of one plane into `out`, dense; those that somebody writes meanwhile are old or new.
     pub fn read(&self, plane: usize, region: Region, out: &mut [u8]) {
         assert_eq!(out.len(), region.voxels() * self.item);
         let row = region.shape()[2] * self.item;
         for (i, offset) in self.rows(plane, region).enumerate() {
-            // SAFETY: as in `write`; reading happens after the writers are done.
-            unsafe { std::ptr::copy_nonoverlapping(self.map.as_ptr().add(offset), out[i * row..].as_mut_ptr(), row) };
+            let to = &mut out[i * row..][..row];
+            with_words!(self, offset, row, words => words.iter().zip(to.chunks_exact_mut(self.word())).for_each(|(w, b)| w.get(b)));
         }
+    }
+
+    /// Bytes that are stored at once.
+    fn word(&self) -> usize {
+        if [2, 4, 8].contains(&self.item) { self.item } else { 1 }
+    }
+
+    /// Part of the mapping, as words.
+    fn words<W: Word>(&self, offset: usize, bytes: usize) -> &[W] {
+        let size = size_of::<W>();
+        assert!(offset + bytes <= self.map.len() && offset.is_multiple_of(size) && bytes.is_multiple_of(size));
+        // SAFETY: the part lies inside the mapping, which starts at a page (so the words are aligned), lives as long as `self` and
+        // is touched by this process through atomics alone; any bytes are an integer.
+        unsafe { std::slice::from_raw_parts(self.map.as_ptr().add(offset).cast(), bytes / size) }
     }
 
     /// Makes what was written durable.
@@ -144,6 +198,23 @@ mod tests {
         assert_eq!(out, bytes);
         again.read(0, region, &mut out);
         assert_eq!(out, [0; 16]);
+    }
+
+    #[test]
+    fn items_of_every_size_come_back() {
+        let dir = tempfile::tempdir().unwrap();
+        for item in [1, 2, 3, 4, 8] {
+            let spill = Spill::open(&dir.path().join(item.to_string()), [3, 5, 7], 2, item).unwrap();
+            let region = Region::new([0, 1, 2], [3, 4, 7]);
+            let bytes: Vec<u8> = (0..region.voxels() * item).map(|i| (i * 37) as u8).collect();
+            spill.write(1, region, &bytes);
+            let mut out = vec![0; bytes.len()];
+            spill.read(1, region, &mut out);
+            assert_eq!(out, bytes);
+            let one = Region::new([2, 3, 6], [3, 4, 7]);
+            spill.read(1, one, &mut out[..item]);
+            assert_eq!(out[..item], bytes[bytes.len() - item..]);
+        }
     }
 
     #[test]

@@ -66,6 +66,47 @@ pub fn gzip(bytes: &[u8]) -> Vec<u8> {
     writer.finish().unwrap()
 }
 
+/// Writes a stack of bytes as pages of one strip each, packed by zlib; the strip of one page is none.
+pub fn deflated_tiff(path: &Path, [nz, ny, nx]: [usize; 3], voxels: &[u8], broken: Option<usize>) {
+    let mut file = b"II\x2a\x00\x00\x00\x00\x00".to_vec();
+    let mut link = 4;
+    for z in 0..nz {
+        let mut packer = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+        packer.write_all(&voxels[z * ny * nx..][..ny * nx]).unwrap();
+        let mut strip = packer.finish().unwrap();
+        if broken == Some(z) {
+            strip.fill(0x55);
+        }
+        let start = file.len() as u32;
+        file.extend(&strip);
+        file.resize(file.len().next_multiple_of(2), 0);
+        let here = file.len() as u32;
+        file[link..link + 4].copy_from_slice(&here.to_le_bytes());
+        // Width, height, bits, compression, black is zero, strip, samples, rows, bytes of the strip.
+        let entries: [(u16, u32); 9] = [
+            (256, nx as u32),
+            (257, ny as u32),
+            (258, 8),
+            (259, 8),
+            (262, 1),
+            (273, start),
+            (277, 1),
+            (278, ny as u32),
+            (279, strip.len() as u32),
+        ];
+        file.extend((entries.len() as u16).to_le_bytes());
+        for (tag, value) in entries {
+            file.extend(tag.to_le_bytes());
+            file.extend(4u16.to_le_bytes());
+            file.extend(1u32.to_le_bytes());
+            file.extend(value.to_le_bytes());
+        }
+        link = file.len();
+        file.extend([0; 4]);
+    }
+    std::fs::write(path, file).unwrap();
+}
+
 pub fn copy_tree(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap() {

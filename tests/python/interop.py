@@ -373,6 +373,12 @@ def formats(folder):
         want = np.full(v.shape, 7)
         want[:5] = v[:5]
         close(f"Zarr v{version}", plain(folder, f"path = 'z{version}'"), want, 0)
+    fortran = {"zarr_format": 2, "order": "F"}
+    turned = {"zarr_format": 3, "filters": [zarr.codecs.TransposeCodec(order=(1, 2, 0))]}
+    for name, keys in [("zf", fortran), ("zt", turned)]:
+        z = zarr.create_array(store=str(folder / name), shape=v.shape, chunks=(4, 5, 6), dtype="i2", **keys)
+        z[:] = v
+        close(f"Zarr {name}", plain(folder, f"path = '{name}'"), v, 0)
     z = zarr.create_array(store=str(folder / "zs"), shape=v.shape, chunks=(4, 4, 4), shards=(8, 8, 8), dtype="i2", zarr_format=3)
     z[:] = v
     close("Zarr sharded", plain(folder, "path = 'zs'"), v, 0)

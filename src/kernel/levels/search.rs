@@ -64,8 +64,7 @@ pub(crate) fn bytes(level: Level, row: &[u8], table: &[u8; 256], turn: u8, codes
 
 /// A row of a type of 8 bits as bytes.
 pub(crate) fn as_bytes<T: Voxel>(row: &[T]) -> Option<&[u8]> {
-    // SAFETY: of that size, and voxels are plain numbers.
-    (size_of::<T>() == 1).then(|| unsafe { std::slice::from_raw_parts(row.as_ptr().cast(), row.len()) })
+    (size_of::<T>() == 1).then(|| bytemuck::cast_slice(row))
 }
 
 #[cfg(target_arch = "x86_64")]

@@ -10,7 +10,7 @@ pub(super) const LANES: usize = 64;
 
 /// An unsigned integer that orders voxels by density. 0 is what nobody can be less than: missing voxels and everything
 /// outside get it, so that lines pass through them.
-pub(super) trait Key: Plain + Ord + Default + Send + Sync + 'static {
+pub(super) trait Key: bytemuck::Pod + Ord + Default + Send + Sync {
     const ZERO: Self;
     const MAX: Self;
     fn not(self) -> Self;
@@ -20,8 +20,6 @@ pub(super) trait Key: Plain + Ord + Default + Send + Sync + 'static {
 
 macro_rules! key {
     ($($t:ty),*) => {$(
-        // SAFETY: a primitive integer.
-        unsafe impl Plain for $t {}
         impl Key for $t {
             const ZERO: Self = 0;
             const MAX: Self = <$t>::MAX;
@@ -35,18 +33,6 @@ macro_rules! key {
     )*};
 }
 key!(u8, u16, u32, u64);
-
-/// Integers: every bit pattern is a value.
-///
-/// # Safety
-/// Only types without padding and invalid bit patterns may be `Plain`.
-pub(super) unsafe trait Plain: Copy {}
-// SAFETY: primitive integers.
-unsafe impl Plain for i32 {}
-// SAFETY: as above.
-unsafe impl Plain for i64 {}
-// SAFETY: as above.
-unsafe impl Plain for usize {}
 
 /// Element types with an order-preserving map to a [`Key`].
 pub(super) trait Coded: Voxel {

@@ -42,13 +42,14 @@ mod wide;
 use std::convert::Infallible;
 
 use super::Context;
+use crate::brick::scratch::cut;
 use crate::grid::{AnyView, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::simd::Level;
 use crate::stage::{DirectionSet, DirectionWeights, Rho};
 use crate::with_view;
 use driver::{FRAMES, in_frame};
 use keys::{Code, Coded, Key, Volume};
-use room::{Sizes, carve};
+use room::Sizes;
 use tiles::{Pass, Supply, tile_of};
 
 pub use lines::{is_valid_count, rho};
@@ -151,7 +152,7 @@ impl Prepared {
         let most = self.scratch_bytes(src.dtype(), src_box.shape(), dst_box.shape(), colour, normal) + mask;
         let bytes = cx.scratch.take(most);
         if let (AnyView::F32(v), None) = (src, self.params.missing) {
-            let (codes, rest) = carve::<u8>(&mut *bytes, src_box.voxels());
+            let (codes, rest) = cut::<u8>(&mut *bytes, src_box.voxels());
             if ranks::rank(v, codes) {
                 return self.sweep_typed(View::dense(codes, v.shape), src_box, dst_box, io, cx.level, rest);
             }
@@ -210,10 +211,10 @@ impl Prepared {
         let weighted = io.rgb.is_some() || io.normal.is_some();
         let sizes = self.sizes(src_box.shape(), dst_box.shape(), weighted);
         let words = io.needed.map_or([0; 2], |_| self.mask_words(dst_box.shape()));
-        let (natural_mask, bytes) = carve::<u64>(bytes, words[0]);
-        let (turned_mask, bytes) = carve::<u64>(bytes, words[1]);
-        let (natural, bytes) = carve::<T::Key>(bytes, sizes.keys[0]);
-        let (swapped, bytes) = carve::<T::Key>(bytes, sizes.keys[1]);
+        let (natural_mask, bytes) = cut::<u64>(bytes, words[0]);
+        let (turned_mask, bytes) = cut::<u64>(bytes, words[1]);
+        let (natural, bytes) = cut::<T::Key>(bytes, sizes.keys[0]);
+        let (swapped, bytes) = cut::<T::Key>(bytes, sizes.keys[1]);
         let (buffers, bytes) = sizes.buffers::<T::Key>(bytes);
 
         let code = Code::new(&self.params);

@@ -1,9 +1,10 @@
 //! How the scratch of a sweep is cut up.
 
 use super::driver::{Buffers, TOGETHER};
-use super::keys::{Key, LANES, Plain};
+use super::keys::{Key, LANES};
 #[cfg(target_arch = "x86_64")]
 use super::wide;
+use crate::brick::scratch::cut;
 
 /// Elements of the parts of the scratch.
 pub(super) struct Sizes {
@@ -47,30 +48,25 @@ impl Sizes {
 
     /// Working memory of the driver, off the front of `bytes`.
     pub fn buffers<'a, K: Key>(&self, bytes: &'a mut [u8]) -> (Buffers<'a, K>, &'a mut [u8]) {
-        let (sheet, bytes) = carve::<K>(bytes, self.sheet * LANES);
-        let (hits, bytes) = carve_all::<u32, 2>(bytes, self.queries * LANES);
-        let (stack, bytes) = carve::<u32>(bytes, self.sheet);
-        let (starts, bytes) = carve::<usize>(bytes, self.sheet);
-        let (turned, bytes) = carve::<u8>(bytes, self.turned(size_of::<K>()));
-        let (shifts, bytes) = carve_all::<i32, { 1 + TOGETHER }>(bytes, self.extent);
-        let (forward, bytes) = carve_all::<u32, TOGETHER>(bytes, self.extent + 1);
-        let (backward, bytes) = carve_all::<u32, TOGETHER>(bytes, self.extent + 1);
+        let (sheet, bytes) = cut::<K>(bytes, self.sheet * LANES);
+        let (hits, bytes) = cut_all::<u32, 2>(bytes, self.queries * LANES);
+        let (stack, bytes) = cut::<u32>(bytes, self.sheet);
+        let (starts, bytes) = cut::<usize>(bytes, self.sheet);
+        let (turned, bytes) = cut::<u8>(bytes, self.turned(size_of::<K>()));
+        let (shifts, bytes) = cut_all::<i32, { 1 + TOGETHER }>(bytes, self.extent);
+        let (forward, bytes) = cut_all::<u32, TOGETHER>(bytes, self.extent + 1);
+        let (backward, bytes) = cut_all::<u32, TOGETHER>(bytes, self.extent + 1);
         (Buffers { sheet, hits, stack, starts, turned, shifts, tables: [forward, backward] }, bytes)
     }
 }
 
-/// Cuts `len` elements off the front of a slice that is aligned to 64 bytes.
-pub(super) fn carve<T: Plain>(bytes: &mut [u8], len: usize) -> (&mut [T], &mut [u8]) {
-    let (head, tail) = bytes.split_at_mut((len * size_of::<T>()).next_multiple_of(64));
-    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
-    // SAFETY: aligned (just checked), long enough, and every bit pattern is valid for the integers that are `Plain`.
-    (unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }, tail)
-}
-
-/// As [`carve`], several times.
-pub(super) fn carve_all<T: Plain, const N: usize>(mut bytes: &mut [u8], len: usize) -> ([&mut [T]; N], &mut [u8]) {
+/// As [`cut`], several times.
+pub(super) fn cut_all<T: bytemuck::Pod, const N: usize>(
+    mut bytes: &mut [u8],
+    len: usize,
+) -> ([&mut [T]; N], &mut [u8]) {
     let parts = std::array::from_fn(|_| {
-        let (part, rest) = carve(std::mem::take(&mut bytes), len);
+        let (part, rest) = cut(std::mem::take(&mut bytes), len);
         bytes = rest;
         part
     });

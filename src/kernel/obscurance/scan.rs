@@ -47,8 +47,8 @@ impl Hit for u32 {
         self as usize
     }
     fn bytes(answers: &mut [u32]) -> &mut [u8] {
-        // SAFETY: the place of the answers has four times as many bytes, and every bit pattern is valid for both.
-        unsafe { std::slice::from_raw_parts_mut(answers.as_mut_ptr().cast(), answers.len()) }
+        let n = answers.len();
+        &mut bytemuck::cast_slice_mut(answers)[..n]
     }
     fn widen(answers: &mut [u32]) {
         for i in (0..answers.len()).rev() {

@@ -4,11 +4,11 @@
 use super::driver::{self, Buffers, FRAMES};
 use super::keys::{Key, Volume};
 use super::lines::Family;
-use super::room::carve;
 use super::sinks::{self, OpenSum, Sink};
 use super::wanted::{self, LineCounts, Wanted};
 use super::weighted::{self, WeightedSum};
 use super::{ObscuranceIo, Prepared, f32_view};
+use crate::brick::scratch::cut;
 use crate::grid::{Region, Shape, View};
 use crate::kernel::simd::Level;
 
@@ -82,8 +82,8 @@ impl<K: Key> Pass<'_, K> {
             let needed = needed.map(|mask| mask.part(dst_box.offset_of(&tile), tile.shape()));
             let lens = FRAMES.map(|frame| sinks::sums_len(tile.shape(), frame));
             let used = |yes: bool| if yes { lens } else { [0; 2] };
-            let (natural, rest) = carve::<u32>(&mut *bytes, used(fast)[0]);
-            let (turned, rest) = carve::<u32>(rest, used(fast)[1]);
+            let (natural, rest) = cut::<u32>(&mut *bytes, used(fast)[0]);
+            let (turned, rest) = cut::<u32>(rest, used(fast)[1]);
             let (weights, rest) = weighted::pair(rest, used(normal.is_some()));
             let (open, rest) = weighted::pair(rest, used(normal.is_some()));
             let (red, rest) = weighted::pair(rest, used(rgb.is_some()));

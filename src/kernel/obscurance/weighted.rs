@@ -3,9 +3,9 @@
 use super::contribute;
 use super::keys::LANES;
 use super::lines::Family;
-use super::room::carve;
 use super::scan::Hit;
 use super::sinks::{Sink, Strip, Visit, add_turned, strides};
+use crate::brick::scratch::cut;
 use crate::grid::{Region, View};
 use crate::kernel::simd::Level;
 use crate::multiversion;
@@ -54,8 +54,8 @@ pub(super) struct WeightedSum<'a> {
 
 /// Sums of both frames.
 pub(super) fn pair(bytes: &mut [u8], [natural, turned]: [usize; 2]) -> ([&mut [i64]; 2], &mut [u8]) {
-    let (natural, bytes) = carve(bytes, natural);
-    let (turned, bytes) = carve(bytes, turned);
+    let (natural, bytes) = cut(bytes, natural);
+    let (turned, bytes) = cut(bytes, turned);
     ([natural, turned], bytes)
 }
 

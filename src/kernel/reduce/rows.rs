@@ -69,9 +69,8 @@ pub fn direct<S: Summed>(
 ) -> bool {
     match kind {
         Reduce::Mean => {
-            // SAFETY: `Wide` is i32 or f64, both plain numbers no larger and no stricter aligned than f64.
-            let line = unsafe { std::slice::from_raw_parts_mut(line.as_mut_ptr().cast::<S::Wide>(), line.len()) };
-            sum(level, rows, halve_x, line, out)
+            let n = line.len();
+            sum(level, rows, halve_x, &mut bytemuck::cast_slice_mut::<_, S::Wide>(line)[..n], out)
         }
         Reduce::Min => extreme(level, false, rows, halve_x, out),
         Reduce::Max => extreme(level, true, rows, halve_x, out),

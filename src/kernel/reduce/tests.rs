@@ -357,7 +357,15 @@ fn buffers_are_reused() {
 fn cells_of_one_value_are_those_of_its_voxels() {
     let (mut scratch, level) = (Scratch::new(), Level::detect());
     let mut cx = Context { level, scratch: &mut scratch };
-    let values = [(DType::U8, 7.0), (DType::F32, 0.1f32 as f64), (DType::F32, -0.0), (DType::I32, -2147483647.0)];
+    let values = [
+        (DType::U8, 7.0),
+        (DType::F32, 0.1f32 as f64),
+        (DType::F32, -0.0),
+        (DType::I32, -2147483647.0),
+        (DType::F32, f64::NAN),
+        (DType::F64, f64::NAN),
+        (DType::F64, 0.0),
+    ];
     for shape in [[8, 8, 8], [13, 9, 21], [1, 1, 1], [5, 1, 40]] {
         for ((dtype, v), kind) in values.iter().flat_map(|v| KINDS.map(|k| (*v, k))) {
             for excluded in [false, true] {

@@ -3,8 +3,9 @@
 use super::estimate::{self, Acc, Code, Polarity, RowSum, Spread, Width};
 use super::int::Setup;
 use super::openness::Target;
-use super::plan::{Plain, cut, padded};
+use super::plan::cut;
 use super::{WindowOut, exact, finish, openness};
+use crate::brick::scratch::padded;
 use crate::grid::{Affine, AnyViewMut, ViewMut, Voxel};
 use crate::kernel::simd::Level;
 use crate::stage::{Method, Ties, WindowChannel, WindowParams};
@@ -73,7 +74,7 @@ impl<'a, 'b> Emit<'a, 'b> {
     }
 
     /// Writes the rows that start at output voxel `at`.
-    pub fn int_rows<T: Code + Plain, X1: RowSum, X2: Acc>(
+    pub fn int_rows<T: Code, X1: RowSum, X2: Acc>(
         &mut self,
         setup: &Setup<T>,
         rows: IntRows<T, X1, X2>,
@@ -114,7 +115,7 @@ impl<'a, 'b> Emit<'a, 'b> {
     }
 
     /// Writes mean, variance, std or second moment of 32-bit codes as channel `i`, row by row.
-    fn long_moments<T: Code + Plain, X1: RowSum, X2: Acc>(
+    fn long_moments<T: Code, X1: RowSum, X2: Acc>(
         &mut self,
         setup: &Setup<T>,
         rows: &IntRows<T, X1, X2>,
@@ -148,7 +149,7 @@ impl<'a, 'b> Emit<'a, 'b> {
     }
 
     /// Writes openness as channel `i`.
-    fn int_openness<T: Code + Plain, X1: RowSum, X2: Acc>(
+    fn int_openness<T: Code, X1: RowSum, X2: Acc>(
         &mut self,
         setup: &Setup<T>,
         rows: &IntRows<T, X1, X2>,
@@ -335,7 +336,7 @@ fn moment_inner<O: Voxel>(channel: WindowChannel, mean: &[f64], variance: &[f64]
 }
 
 /// Writes extremes given as codes: stored values where nothing scales them.
-fn put_codes<T: Code + Plain>(level: Level, dst: &mut AnyViewMut, part: &Part, codes: &[T], flip: T, affine: Affine) {
+fn put_codes<T: Code>(level: Level, dst: &mut AnyViewMut, part: &Part, codes: &[T], flip: T, affine: Affine) {
     let offset = flip.u32() as f64;
     macro_rules! uncode {
         ($d:ident) => {{
@@ -388,10 +389,9 @@ fn uncode_inner<T: Code>(codes: &[T], pitch: usize, flip: T, to: Target<T>, rows
 }
 
 /// The same numbers as another type of the same size. Panics if the sizes differ.
-pub fn bits_mut<T: Plain, U: Voxel>(row: &mut [U]) -> &mut [T] {
+pub fn bits_mut<T: bytemuck::Pod, U: Voxel>(row: &mut [U]) -> &mut [T] {
     assert_eq!(size_of::<T>(), size_of::<U>(), "types of one size");
-    // SAFETY: equal size (asserted) and alignment (primitive numbers), and every bit pattern is a value of both.
-    unsafe { std::slice::from_raw_parts_mut(row.as_mut_ptr().cast(), row.len()) }
+    bytemuck::cast_slice_mut(row)
 }
 
 /// NaN (0 where the type has none) at the voxels of a row that `gone` names.

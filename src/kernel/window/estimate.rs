@@ -7,7 +7,7 @@ use crate::kernel::simd::Level;
 use crate::kernel::singles::{F32x32, SINGLES};
 
 /// Integer that sums are kept in; arithmetic wraps, and the caller proves that final values fit.
-pub trait Acc: Copy + Default + PartialOrd + std::fmt::Debug + 'static {
+pub trait Acc: bytemuck::Pod + Default + PartialOrd + std::fmt::Debug {
     fn plus(self, o: Self) -> Self;
     fn minus(self, o: Self) -> Self;
     fn wide(self) -> u128;

@@ -3,8 +3,9 @@
 //! without such values, all but a few, are only looked through.
 
 use super::float;
-use super::plan::{self, Job, Needs, cut, padded};
+use super::plan::{self, Job, Needs, cut};
 use super::{Place, WindowOut};
+use crate::brick::scratch::padded;
 use crate::grid::{Affine, AnyViewMut, DType, Region, Shape, View, ViewMut};
 use crate::kernel::Context;
 use crate::kernel::simd::Level;

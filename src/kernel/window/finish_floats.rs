@@ -3,8 +3,9 @@
 
 use super::emit::Emit;
 use super::float::{Row, emit_row};
-use super::plan::{cut, padded};
+use super::plan::cut;
 use super::{WindowOut, check};
+use crate::brick::scratch::padded;
 use crate::grid::{AnyView, Shape, View};
 use crate::kernel::Context;
 use crate::stage::WindowParams;

@@ -15,15 +15,16 @@ use super::lines::Elem;
 use super::merge::{Sum, Weight};
 use super::moments::{self, First, Held, Layout, Moments, Pass, Wanted};
 use super::parts::{BLOCK, Weights};
-use super::plan::{self, Job, Needs, Plain, Tile, cut, padded};
+use super::plan::{self, Job, Needs, Tile, cut};
 use super::{Place, WindowOut};
+use crate::brick::scratch::padded;
 use crate::grid::{AnyViewMut, Shape, View};
 use crate::kernel::lanes::LANES;
 use crate::kernel::simd::Level;
 use crate::stage::{WindowChannel, WindowParams};
 
 /// f32 (sums in f64) or f64 (sums in pairs of f64).
-pub trait Float: Elem + Plain + Centre + First {
+pub trait Float: Elem + Centre + First {
     fn row_of<'a>(dst: &'a mut AnyViewMut, at: [usize; 3], len: usize) -> Option<&'a mut [Self]>;
 }
 impl Float for f32 {

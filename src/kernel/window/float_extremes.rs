@@ -4,7 +4,8 @@ use super::along::SLACK;
 use super::extremes::{blocked, deep_len, rows_extremes};
 use super::float::{Float, Lines, empty_rows, first, made_above};
 use super::lines::{self, Coding, Masked, Pitches, Sources};
-use super::plan::{Job, Tile, cut, padded};
+use super::plan::{Job, Tile, cut};
+use crate::brick::scratch::padded;
 use crate::kernel::simd::Level;
 
 /// Minimum and maximum on their way through the three axes.

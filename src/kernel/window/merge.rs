@@ -4,14 +4,14 @@
 //! Nothing large is subtracted but sums of neighbours, so a step of 1e6 elsewhere in the tile, or in the window, costs no
 //! accuracy. The order of merges is that of [`super::parts`].
 
-use super::plan::Plain;
 use crate::kernel::lanes::F64x8;
 
 /// Counts are below it.
 const SCALE: f64 = (1u64 << 31) as f64;
 
 /// What the merge of two parts asks of their counts.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
 pub struct Weight {
     /// `n_b / n_a`; 0 where a part is empty.
     ratio: f64,
@@ -22,9 +22,6 @@ pub struct Weight {
     b: f64,
     inverse: f64,
 }
-
-// SAFETY: five plain f64.
-unsafe impl Plain for Weight {}
 
 impl Weight {
     #[inline(always)]
@@ -98,7 +95,7 @@ pub fn plus_pairs<L: F64x8>(a: [L; 2], b: [L; 2]) -> [L; 2] {
 }
 
 /// Finished sum of f32 (f64) or of f64 (an unevaluated pair of f64).
-pub trait Sum: Plain + Default + std::fmt::Debug {
+pub trait Sum: bytemuck::Pod + Default + std::fmt::Debug {
     const PAIR: bool;
     /// A variance below this share of the squared mean is an error of rounding: two different numbers of the input's type
     /// among 2^31 make a larger one.
@@ -136,15 +133,12 @@ impl Sum for f64 {
 }
 
 /// `hi + lo`, about 106 bits.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub struct Pair {
     hi: f64,
     lo: f64,
 }
-
-// SAFETY: two plain f64.
-unsafe impl Plain for Pair {}
 
 impl Sum for Pair {
     const PAIR: bool = true;

@@ -24,6 +24,7 @@ mod float_extremes;
 mod float_power;
 mod float_spread;
 mod int;
+mod int_extremes;
 mod lines;
 #[doc(hidden)]
 pub mod math;
@@ -34,6 +35,7 @@ mod parts;
 mod plan;
 #[doc(hidden)]
 pub mod reference;
+mod running;
 mod slide;
 #[cfg(test)]
 mod tests;
@@ -43,8 +45,8 @@ pub use estimate::Width;
 #[doc(hidden)]
 pub use float_power::power_row;
 use int::Dispatch;
+use plan::Job;
 pub use plan::Needs;
-use plan::{Job, Plain};
 
 /// One requested result. Its element type must be: for `Min` and `Max` the input's type where the affine is the identity,
 /// else `src.dtype().result()`; for everything else `src.dtype().result()`. An `Openness` may also ask for `u8` where
@@ -152,7 +154,7 @@ fn check(src: AnyView, params: &WindowParams, at: [usize; 3], dst: Shape, outs: 
 }
 
 /// Integer volumes of type `S` as unsigned codes `C`: stored bits XOR `flip`.
-fn integers<S: Voxel + Plain, C: Dispatch>(
+fn integers<S: Voxel, C: Dispatch>(
     src: View<S>,
     flip: C,
     params: &WindowParams,

@@ -11,7 +11,8 @@ use std::marker::PhantomData;
 
 use super::merge::{self, Weight};
 use super::parts::{BLOCK, OCTET, Parts, Weights, block, groups, octet};
-use super::plan::{cut, padded};
+use super::plan::cut;
+use crate::brick::scratch::padded;
 use crate::grid::Voxel;
 use crate::kernel::lanes::{F64x8, LANES};
 use crate::kernel::simd::Level;

@@ -4,6 +4,7 @@ use super::Place;
 use super::extremes::DEEP;
 use super::lines::Lines;
 use super::parts::{Axis, BLOCK};
+use crate::brick::scratch;
 use crate::grid::{DType, Shape, View, Voxel};
 use crate::kernel::simd::fetch;
 use crate::stage::{Method, WindowChannel, WindowParams};
@@ -235,13 +236,7 @@ impl Stage {
     }
 
     /// Copies the lines of buffer row `j` into `buffer`, if it holds them, and says where to read them.
-    pub fn fill<'a, T: Plain + Voxel>(
-        &self,
-        tile: &Tile,
-        src: View<'a, T>,
-        j: usize,
-        buffer: &'a mut [T],
-    ) -> (&'a [T], Lines) {
+    pub fn fill<'a, T: Voxel>(&self, tile: &Tile, src: View<'a, T>, j: usize, buffer: &'a mut [T]) -> (&'a [T], Lines) {
         let (y, x) = (tile.rows.2 + j - tile.rows.0, tile.cols.2);
         if buffer.is_empty() {
             let clip = (0, src.shape[0] as isize);
@@ -331,39 +326,17 @@ impl Tile {
     }
 }
 
-/// Takes `len` elements off the front of 64-byte-aligned scratch. Panics if it is too short.
-///
-/// `T` is one of the plain numbers of this module (u8 to u128, f32, f64 or pairs of f64).
-pub fn cut<'a, T: Plain>(bytes: &mut &'a mut [u8], len: usize) -> &'a mut [T] {
-    let (head, tail) = std::mem::take(bytes).split_at_mut(padded::<T>(len));
-    *bytes = tail;
-    assert_eq!(head.as_ptr() as usize % 64, 0, "scratch is aligned to 64 bytes");
-    // SAFETY: aligned (just checked) and long enough; `Plain` types take every bit pattern.
-    unsafe { std::slice::from_raw_parts_mut(head.as_mut_ptr().cast(), len) }
+/// Cuts `len` elements off the front of a scratch slice, as [`scratch::cut`] does, and leaves the rest in `bytes`.
+pub fn cut<'a, T: bytemuck::Pod>(bytes: &mut &'a mut [u8], len: usize) -> &'a mut [T] {
+    let (part, rest) = scratch::cut(std::mem::take(bytes), len);
+    *bytes = rest;
+    part
 }
 
 /// The elements from `from` on; none of an empty slice.
 pub fn tail<T>(slice: &[T], from: usize) -> &[T] {
     &slice[from.min(slice.len())..]
 }
-
-/// Bytes that [`cut`] takes.
-pub fn padded<T>(len: usize) -> usize {
-    (len * size_of::<T>()).div_ceil(64) * 64
-}
-
-/// Types of which every bit pattern is a value and whose alignment divides 64.
-///
-/// # Safety
-/// Implement for plain numbers only.
-pub unsafe trait Plain: Copy {}
-macro_rules! plain {
-    ($($t:ty)*) => {$(
-        // SAFETY: a primitive number without padding.
-        unsafe impl Plain for $t {}
-    )*};
-}
-plain!(u8 i8 u16 i16 u32 i32 u64 u128 f32 f64);
 
 /// Bytes per voxel of the moments of a batch of planes.
 pub fn batch_bytes(dtype: DType, needs: Needs) -> usize {
@@ -373,10 +346,9 @@ pub fn batch_bytes(dtype: DType, needs: Needs) -> usize {
 }
 
 /// The same numbers as another type of the same size. Panics if the sizes differ.
-pub fn bits<T: Plain, U: Plain>(data: &[U]) -> &[T] {
-    assert!(size_of::<T>() == size_of::<U>() && align_of::<T>() <= align_of::<U>(), "types of one size");
-    // SAFETY: equal size and alignment (asserted), and every bit pattern is a value of both.
-    unsafe { std::slice::from_raw_parts(data.as_ptr().cast(), data.len()) }
+pub fn bits<T: bytemuck::Pod, U: bytemuck::Pod>(data: &[U]) -> &[T] {
+    assert_eq!(size_of::<T>(), size_of::<U>(), "types of one size");
+    bytemuck::cast_slice(data)
 }
 
 /// Asks for the `cols` voxels below those at `at`, which the next line of a tile reads: lines of far planes are too short for

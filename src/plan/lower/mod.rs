@@ -12,7 +12,7 @@ use super::{Prepass, lengths};
 use crate::config::{Config, Input, Modulation, ObscuranceOp, Op, Place, Ref, StageNode, op_channels};
 use crate::grid::Border;
 use crate::kernel::gaussian;
-use crate::stage::{Reduce, WindowChannel};
+use crate::stage::{Reduce, WindowChannel, WindowShape};
 use crate::store::VolumeInfo;
 use crate::{Error, Result};
 use ops::box_channel;
@@ -27,6 +27,9 @@ pub struct Lowered {
     pub prepasses: Vec<Prepass>,
     /// Occlusion maps by stage index: the wire they read and the level of their dataset 0.
     pub maps: HashMap<usize, (WireId, usize)>,
+    input_wires: HashMap<usize, WireId>,
+    /// By stage and channel.
+    stage_wires: HashMap<(usize, &'static str), WireId>,
 }
 
 struct Lowering<'a> {
@@ -35,8 +38,6 @@ struct Lowering<'a> {
     out: Lowered,
     /// Channels that somebody reads, per stage.
     wanted: Vec<Vec<&'static str>>,
-    input_wires: HashMap<usize, WireId>,
-    stage_wires: HashMap<(usize, &'static str), WireId>,
 }
 
 /// What a name of the config means.
@@ -47,14 +48,8 @@ enum Target {
 
 /// Lowers everything that the outputs read. `infos` are the facts of the config's inputs, in order.
 pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
-    let mut lowering = Lowering {
-        config,
-        infos,
-        out: Lowered::default(),
-        wanted: vec![Vec::new(); config.stages.len()],
-        input_wires: HashMap::new(),
-        stage_wires: HashMap::new(),
-    };
+    let mut lowering =
+        Lowering { config, infos, out: Lowered::default(), wanted: vec![Vec::new(); config.stages.len()] };
     for output in &config.outputs {
         for from in &output.from {
             lowering.want(from, &output.place)?;
@@ -80,13 +75,32 @@ pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
     Ok(lowering.out)
 }
 
-/// Voxels that `nearest` and `reflect` repeat lie in the window themselves: extremes need no copies of them.
+/// Voxels that `nearest` and `reflect` repeat lie in the window themselves. Extremes need no copies of them; along an axis of one
+/// voxel a box or a Gaussian of nothing but copies has the distribution of what it copies, so a plane stays a plane.
 fn forget_mirrors(graph: &mut Graph) {
     for step in &mut graph.steps {
-        let StepKind::Window { channels, .. } = &step.kind else { continue };
-        let extremes = channels.iter().all(|c| matches!(c, WindowChannel::Min | WindowChannel::Max));
-        if extremes && matches!(step.border, Border::Nearest | Border::Reflect) {
-            step.border = Border::Clip;
+        if !matches!(step.border, Border::Nearest | Border::Reflect) {
+            continue;
+        }
+        let shape = graph.lattices[graph.wires[step.inputs[0]].lattice].shape;
+        let radius = match &mut step.kind {
+            StepKind::Window { channels, params } => {
+                if channels.iter().all(|c| matches!(c, WindowChannel::Min | WindowChannel::Max)) {
+                    step.border = Border::Clip;
+                }
+                Some(&mut params.radius)
+            }
+            StepKind::Rank { params, shape: WindowShape::Box, .. }
+            | StepKind::Levels { params, .. }
+            | StepKind::Moments4 { params, .. } => Some(&mut params.radius),
+            // Its kernel renormalises to the voxels that it is given.
+            StepKind::Gaussian { .. } => None,
+            _ => continue,
+        };
+        for reach in radius.into_iter().chain([&mut step.reach]) {
+            for a in (0..3).filter(|&a| shape[a] == 1) {
+                reach[a] = 0;
+            }
         }
     }
 }
@@ -94,14 +108,20 @@ fn forget_mirrors(graph: &mut Graph) {
 impl Lowered {
     /// The wire of a reference; `None` for an occlusion map's channels, which are pyramids of their own.
     pub fn wire_of(&self, config: &Config, reference: &Ref) -> Option<WireId> {
-        let name = match config.stages.iter().find(|s| s.name == reference.name) {
-            Some(stage) => {
-                let channel = reference.channel.as_deref().unwrap_or(op_channels(stage.op.word())[0]);
-                format!("{}.{channel}", stage.name)
-            }
-            None => reference.name.clone(),
-        };
-        self.graph.wires.iter().position(|w| w.name == name)
+        if let Some(input) = config.inputs.iter().position(|i| i.name == reference.name) {
+            return self.input_wires.get(&input).copied();
+        }
+        let stage = config.stages.iter().position(|s| s.name == reference.name)?;
+        let channels = op_channels(config.stages[stage].op.word());
+        let wanted = reference.channel.as_deref().unwrap_or(channels[0]);
+        let channel = *channels.iter().find(|c| **c == wanted)?;
+        self.stage_wires.get(&(stage, channel)).copied()
+    }
+
+    /// Another channel of the stage that makes a wire, if somebody reads it.
+    pub fn beside(&self, wire: WireId, channel: &'static str) -> Option<WireId> {
+        let ((stage, _), _) = self.stage_wires.iter().find(|(_, w)| **w == wire)?;
+        self.stage_wires.get(&(*stage, channel)).copied()
     }
 }
 
@@ -169,7 +189,7 @@ impl Lowering<'_> {
             Target::Input(input) => self.input(input),
             Target::Stage(stage, channel) => {
                 self.stage(stage)?;
-                self.stage_wires.get(&(stage, channel)).copied().ok_or_else(|| {
+                self.out.stage_wires.get(&(stage, channel)).copied().ok_or_else(|| {
                     self.error(
                         place,
                         format!("\"{}\" is an occlusion map: it can be written, not read by a stage", reference.name),
@@ -180,7 +200,7 @@ impl Lowering<'_> {
     }
 
     fn input(&mut self, input: usize) -> Result<WireId> {
-        if let Some(wire) = self.input_wires.get(&input) {
+        if let Some(wire) = self.out.input_wires.get(&input) {
             return Ok(*wire);
         }
         let (node, info): (&Input, &VolumeInfo) = (&self.config.inputs[input], &self.infos[input]);
@@ -201,10 +221,11 @@ impl Lowering<'_> {
             missing: missing.map(|v| v as i64),
             fill: missing.unwrap_or(0.0),
             lattice: self.out.graph.lattices.len() - 1,
+            sink_halo: [0; 3],
             halo: [0; 3],
         };
         let id = self.push_wire(wire);
-        self.input_wires.insert(input, id);
+        self.out.input_wires.insert(input, id);
         Ok(id)
     }
 
@@ -216,7 +237,7 @@ impl Lowering<'_> {
     /// Lowers one stage (once), after those that it reads.
     fn stage(&mut self, index: usize) -> Result<()> {
         let wanted = self.wanted[index].clone();
-        if self.stage_wires.contains_key(&(index, wanted[0])) || self.out.maps.contains_key(&index) {
+        if self.out.stage_wires.contains_key(&(index, wanted[0])) || self.out.maps.contains_key(&index) {
             return Ok(());
         }
         let node = self.config.stages[index].clone();
@@ -246,12 +267,6 @@ impl Lowering<'_> {
             }
             Op::OcclusionMap { input, start_level } => {
                 let src = self.wire(input, place)?;
-                if node.where_.is_some() {
-                    return Err(Error::config(
-                        key("where"),
-                        "an occlusion_map takes no `where`: its levels pool every voxel",
-                    ));
-                }
                 self.out.maps.insert(index, (src, *start_level));
                 Ok(())
             }

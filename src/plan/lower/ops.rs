@@ -17,7 +17,11 @@ impl Lowering<'_> {
     /// Window kernels count voxels in 32 bits.
     pub(super) fn check_window(&self, src: WireId, radius: [usize; 3], border: Border, key: &str) -> Result<()> {
         let shape = self.lattice(src).shape;
-        let cut = |side: f64, a: usize| if border == Border::Clip { side.min(shape[a] as f64) } else { side };
+        // Along an axis of one voxel a mirror adds nothing (`forget_mirrors`).
+        let flat = |a: usize| shape[a] == 1 && !matches!(border, Border::Constant(_));
+        let cut = |side: f64, a: usize| {
+            if border == Border::Clip || flat(a) { side.min(shape[a] as f64) } else { side }
+        };
         let voxels: f64 = (0..3).map(|a| cut(2.0 * radius[a] as f64 + 1.0, a)).product();
         if voxels >= (1u64 << 31) as f64 {
             let message = format!("{radius:?} voxels (z, y, x) make a window of {voxels:.0} voxels; at most 2^31 - 1");

@@ -158,10 +158,11 @@ impl Lowering<'_> {
             missing,
             fill: node.fill.unwrap_or(if ["openness", "lower", "upper"].contains(&channel) { 1.0 } else { 0.0 }),
             lattice: src.lattice,
+            sink_halo: [0; 3],
             halo: [0; 3],
         };
         let id = self.push_wire(wire);
-        self.stage_wires.insert((index, channel), id);
+        self.out.stage_wires.insert((index, channel), id);
         id
     }
 }

@@ -14,10 +14,7 @@ use crate::run::prepass::Finder;
 use crate::run::program::Program;
 use crate::run::read::Reader;
 use crate::run::steps::Engine;
-use crate::run::stream::{Stream, Work};
-
-/// Turns a finished brick into chunks.
-type Deliver<'d> = dyn Fn(&Finished, Work, &mut Scratch) -> Result<Vec<Item>> + Sync + 'd;
+use crate::run::stream::{Stations, Stream, Work};
 
 impl Session<'_> {
     /// What a pre-pass finds over the whole volume.
@@ -47,12 +44,12 @@ impl Session<'_> {
                 "pre-pass",
             );
         };
-        self.stream(&engine, &program, brick, &work, &metrics, &deliver, &|_, _| Ok(()), &tick)?;
+        let stations = Stations { deliver: &deliver, write: &|_, _| Ok(()), tick: &tick };
+        self.stream(&engine, &program, brick, &work, &metrics, &stations)?;
         self.metrics.absorb(&metrics);
         Ok(found.result(prepass.kind))
     }
 
-    #[allow(clippy::too_many_arguments)]
     pub(super) fn stream(
         &self,
         engine: &Engine,
@@ -60,9 +57,7 @@ impl Session<'_> {
         brick: &BrickChoice,
         work: &[Work],
         metrics: &Metrics,
-        deliver: &Deliver,
-        write: &(dyn Fn(Work, Vec<Item>) -> Result<()> + Sync),
-        tick: &(dyn Fn() + Sync),
+        stations: &Stations<Vec<Item>>,
     ) -> Result<()> {
         let cache = ChunkCache::new(brick.cache);
         self.pool.bound((brick.bytes * brick.in_flight as u64 + brick.waiting) as usize);
@@ -79,9 +74,7 @@ impl Session<'_> {
             metrics,
             trace: &self.trace,
             cancel: &self.options.cancel,
-            deliver,
-            write,
-            tick,
+            stations,
         };
         stream.run()
     }

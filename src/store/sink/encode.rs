@@ -7,6 +7,7 @@ use zarrs::array::codec::ZstdCodec;
 use zarrs::array::{BytesToBytesCodecTraits, CodecOptions};
 
 use super::Encoded;
+use crate::brick::Voxels;
 use crate::config::Codec;
 use crate::grid::{AnyView, DType, Shape, View, Voxel};
 use crate::store::blosc;
@@ -20,6 +21,8 @@ pub struct Encoder {
     fill: Vec<u8>,
     fill_is_nan: bool,
     buffers: Mutex<Vec<Vec<u8>>>,
+    /// The voxel that filled a whole chunk last, and that chunk encoded.
+    uniform: Mutex<Option<(Vec<u8>, Vec<u8>)>>,
     options: CodecOptions,
 }
 
@@ -33,23 +36,17 @@ pub fn fill_bytes(dtype: DType, fill: f64) -> Vec<u8> {
     with_dtype!(dtype, T => bytes(T::from_f64(fill)))
 }
 
-/// Voxels as bytes in this machine's order.
-fn native<T: Voxel>(row: &[T]) -> &[u8] {
-    // SAFETY: `Voxel` is implemented for primitive numbers only, which have no padding.
-    unsafe { std::slice::from_raw_parts(row.as_ptr().cast::<u8>(), size_of_val(row)) }
-}
-
 /// The bytes of a dense box of this shape, where they are stored as this machine has them.
 fn whole<T: Voxel>(v: View<'_, T>, chunk: Shape) -> Option<&[u8]> {
     let [nz, ny, nx] = v.shape;
     let dense = v.row == nx && v.plane == nx * ny && v.shape == chunk && cfg!(target_endian = "little");
-    dense.then(|| native(&v.data[..nz * ny * nx]))
+    dense.then(|| bytemuck::cast_slice(&v.data[..nz * ny * nx]))
 }
 
 /// Appends voxels, little-endian.
 fn append_le<T: Voxel>(row: &[T], out: &mut Vec<u8>) {
     let start = out.len();
-    out.extend_from_slice(native(row));
+    out.extend_from_slice(bytemuck::cast_slice(row));
     if cfg!(target_endian = "big") {
         out[start..].chunks_exact_mut(size_of::<T>()).for_each(<[u8]>::reverse);
     }
@@ -87,6 +84,7 @@ impl Encoder {
             fill: fill_bytes(dtype, fill),
             fill_is_nan: dtype.is_float() && fill.is_nan(),
             buffers: Mutex::default(),
+            uniform: Mutex::default(),
             options: CodecOptions::default().with_concurrent_target(1),
         }
     }
@@ -117,6 +115,31 @@ impl Encoder {
         })
     }
 
+    /// As [`Encoder::encode`], of a whole chunk of one voxel.
+    pub fn encode_uniform(&self, voxel: &Voxels, chunk: Shape) -> Result<Encoded> {
+        let nan = voxel.at(0).is_nan();
+        let bytes = fill_bytes(voxel.dtype(), voxel.at(0));
+        if self.fill_is_nan && nan || bytes == self.fill {
+            return Ok(Encoded::Empty);
+        }
+        let mut kept = self.uniform.lock().unwrap_or_else(|e| e.into_inner());
+        if let Some((_, encoded)) = kept.as_ref().filter(|(of, _)| *of == bytes) {
+            return Ok(Encoded::Bytes(encoded.clone()));
+        }
+        let mut raw = self.buffer();
+        raw.clear();
+        append_repeated(&bytes, chunk.iter().product(), &mut raw);
+        if self.codec == Codec::None {
+            return Ok(Encoded::Bytes(raw));
+        }
+        let encoded = self.compress(&raw, voxel.dtype().size());
+        self.reuse(raw);
+        encoded.map(|encoded| {
+            *kept = Some((bytes, encoded.clone()));
+            Encoded::Bytes(encoded)
+        })
+    }
+
     /// A buffer with whatever it held.
     fn buffer(&self) -> Vec<u8> {
         self.buffers.lock().unwrap_or_else(|e| e.into_inner()).pop().unwrap_or_default()
@@ -131,9 +154,12 @@ impl Encoder {
     fn holds_only_fill<T: Voxel>(&self, v: View<T>) -> bool {
         let [nz, ny, nx] = v.shape;
         let line = vec![T::from_le_slice(&self.fill); nx];
+        let line: &[u8] = bytemuck::cast_slice(&line);
         let same = |row: &[T]| match self.fill_is_nan {
             true => row.iter().all(|v| v.to_f64().is_nan()),
-            false => native(&row[..1]) == native(&line[..1]) && native(row) == native(&line),
+            false => {
+                bytemuck::bytes_of(&row[0]) == &line[..size_of::<T>()] && bytemuck::cast_slice::<_, u8>(row) == line
+            }
         };
         nx == 0 || (0..nz).all(|z| (0..ny).all(|y| same(v.row_at(z, y))))
     }
@@ -195,6 +221,29 @@ mod tests {
         assert_eq!(encode(f64::NAN, &[f32::NAN, negative_nan], AnyView::F32), Encoded::Empty);
         assert_ne!(encode(f64::NAN, &[f32::NAN, 0.0], AnyView::F32), Encoded::Empty);
         assert_ne!(encode(0.0, &[0.0f64, -0.0], AnyView::F64), Encoded::Empty, "-0 is not 0");
+    }
+
+    #[test]
+    fn a_chunk_of_one_voxel_is_what_its_voxels_give() {
+        let chunk = [3, 4, 5];
+        for codec in [Codec::None, Codec::BloscLz4, Codec::Zstd(1)] {
+            for dtype in [DType::U8, DType::U16, DType::F32, DType::F64] {
+                for fill in [0.0, 3.0, f64::NAN].into_iter().filter(|f| dtype.is_float() || !f.is_nan()) {
+                    let encoder = Encoder::new(codec, dtype, fill);
+                    for value in [0.0, 3.0, 7.0, 7.0, -0.0, f64::NAN, 7.0] {
+                        let voxel = Voxels::one(dtype, value);
+                        let mut all = Voxels::zeroed(dtype, 60);
+                        all.fill(voxel.at(0));
+                        let expected = encoder.encode(all.view(chunk), chunk).unwrap();
+                        assert_eq!(
+                            encoder.encode_uniform(&voxel, chunk).unwrap(),
+                            expected,
+                            "{dtype} {value} {codec:?}"
+                        );
+                    }
+                }
+            }
+        }
     }
 
     #[test]

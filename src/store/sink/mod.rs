@@ -15,10 +15,12 @@ use std::path::{Path, PathBuf};
 
 use super::Pyramid;
 use super::info::Orientation;
+use crate::brick::Voxels;
 use crate::config::{Codec, OutputFormat};
 use crate::grid::{AnyView, DType, Region, Shape};
 use crate::{Error, Result};
 pub use claim::Claim;
+pub use encode::fill_bytes;
 pub use existing::{Existing, existing, remove_ours};
 
 /// What an output is; made by the planner.
@@ -175,6 +177,11 @@ impl Sink {
         }
         let padded = if self.spec.is_zarr() { self.spec.chunk } else { region.shape() };
         self.encoder.encode(voxels, padded)
+    }
+
+    /// As [`Self::encode`], of a whole chunk of one voxel of the spec's dtype.
+    pub fn encode_uniform(&self, voxel: &Voxels) -> Result<Encoded> {
+        self.encoder.encode_uniform(voxel, self.spec.chunk)
     }
 
     /// Stores an encoded chunk under a temporary name (in its open shard, chunk file or flat file). Returns bytes written.

@@ -5,6 +5,7 @@
 //! again: measured on 512 planes of 1024^2 u16 (zstd, budget 256 MiB, window radius 10), some 40 times.
 
 use std::fs::File;
+use std::ops::Range;
 use std::path::Path;
 
 use super::bytes::{Files, MappedFile};
@@ -30,9 +31,10 @@ const PIECE: usize = 1 << 16;
 /// Bytes of chunks side by side that are written together, at most.
 const BAND: usize = 8 << 20;
 
-/// Bytes of all voxels, all components.
-pub fn bytes(info: &VolumeInfo) -> u64 {
-    (info.voxels() as u64).saturating_mul((info.components * info.dtype.size()) as u64)
+/// Bytes of the voxels of these planes, all components.
+pub fn bytes(info: &VolumeInfo, planes: &Range<usize>) -> u64 {
+    let voxels = (planes.len() as u64).saturating_mul((info.shape[1] * info.shape[2]) as u64);
+    voxels.saturating_mul((info.components * info.dtype.size()) as u64)
 }
 
 /// Whether the stack of chunks under a brick is too much for the cache, while a chunk is not too much for the budget.
@@ -71,10 +73,16 @@ fn place([nz, ny, nx]: Shape, component: usize, [z, y, x]: [i64; 3]) -> usize {
     ((component * nz + z as usize) * ny + y as usize) * nx + x as usize
 }
 
-/// Decodes every chunk once into a nameless file in `scratch`.
-pub fn run(array: &ZarrArray, info: &VolumeInfo, scratch: &Path, progress: Progress) -> Result<Unpacked> {
-    let total = bytes(info);
-    let file = nameless(scratch, total)?;
+/// Decodes every chunk that holds some of these planes once into a nameless file in `scratch`.
+pub fn run(
+    array: &ZarrArray,
+    info: &VolumeInfo,
+    planes: &Range<usize>,
+    scratch: &Path,
+    progress: Progress,
+) -> Result<Unpacked> {
+    let total = bytes(info, &(0..info.shape[0]));
+    let file = nameless(scratch, bytes(info, planes))?;
     let failed = |e: std::io::Error| Error::file(scratch, format!("scratch: {e}"));
     // What is not written reads as 0.
     file.set_len(total).map_err(failed)?;
@@ -97,6 +105,9 @@ pub fn run(array: &ZarrArray, info: &VolumeInfo, scratch: &Path, progress: Progr
     for c in 0..info.components {
         for outer in whole.cells([0; 3], wide).iter() {
             let cell = Region::of_cell(outer, [0; 3], wide).clip(&whole);
+            if cell.hi[0] <= planes.start as i64 || cell.lo[0] >= planes.end as i64 {
+                continue;
+            }
             let mut stored = false;
             for index in cell.cells([0; 3], chunk).iter() {
                 match array.read_chunk(c, index, &mut voxels)? {

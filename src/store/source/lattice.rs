@@ -1,5 +1,7 @@
 //! Where each voxel lies in plain bytes, and the copy from there into a brick.
 
+use std::ops::Range;
+
 use super::bytes::Files;
 use crate::grid::{AnyViewMut, DType, Region, Shape, ViewMut, Voxel};
 use crate::kernel::simd::Level;
@@ -84,6 +86,13 @@ impl Lattice {
         Some(ends)
     }
 
+    /// Byte after the last one of these planes, of any component, where they lie evenly in one file.
+    pub fn end_of(&self, planes: &Range<usize>) -> Option<u64> {
+        let Planes::Even { bases, plane } = &self.planes else { return None };
+        let Some(last) = planes.clone().next_back() else { return Some(0) };
+        Some(bases.iter().max()? + last as u64 * plane + self.plane_span()?)
+    }
+
     /// Copies the box into `dst`, which has its shape and the lattice's type. Returns the bytes taken. Pages of mapped files
     /// are let go behind it unless they are to be kept.
     #[allow(clippy::too_many_arguments)]
@@ -142,7 +151,7 @@ impl Lattice {
         let dense = dst.row == nx && self.step as usize == size_of::<T>() && self.row == self.step * nx as u64;
         let fits = dense && ny * nx * size_of::<T>() >= RUN;
         let from = z * dst.plane;
-        fits.then(|| as_bytes(&mut dst.data[from..from + ny * nx]))
+        fits.then(|| bytemuck::cast_slice_mut(&mut dst.data[from..from + ny * nx]))
     }
 
     /// One plane of a box: `bytes` starts at the box's first voxel of it.
@@ -151,7 +160,7 @@ impl Lattice {
         let (row, step, size) = (self.row as usize, self.step as usize, size_of::<T>());
         for y in 0..ny {
             let from = &bytes[y * row..];
-            let into = as_bytes(dst.row_at(z, y));
+            let into = bytemuck::cast_slice_mut(dst.row_at(z, y));
             if step == size {
                 into.copy_from_slice(&from[..nx * size]);
             } else {
@@ -164,11 +173,6 @@ impl Lattice {
             }
         }
     }
-}
-
-fn as_bytes<T: Voxel>(row: &mut [T]) -> &mut [u8] {
-    // SAFETY: `Voxel` is implemented for primitive numbers only: no padding, and every bit pattern is a value.
-    unsafe { std::slice::from_raw_parts_mut(row.as_mut_ptr().cast(), std::mem::size_of_val(row)) }
 }
 
 multiversion! {

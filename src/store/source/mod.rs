@@ -21,10 +21,12 @@ mod spool;
 mod synthetic;
 mod tiff;
 mod tiff_text;
+mod transposed;
 pub mod units;
 mod zarr;
 mod zarr_meta;
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::VolumeInfo;
@@ -46,6 +48,8 @@ pub struct Source {
     level: Level,
     /// Of a Zarr array that is read from scratch: `None` until it is there.
     flat: Option<Option<Unpacked>>,
+    /// Planes of a Zarr array that will be read.
+    planes: Range<usize>,
 }
 
 #[derive(Debug)]
@@ -75,7 +79,8 @@ impl Source {
             InputKind::Path { path, raw } => open_path(input, path, raw.as_ref())?,
         };
         let info = overridden(info, input)?;
-        Ok(Source { info, kind, level: Level::detect(), flat: None })
+        let planes = 0..info.shape[0];
+        Ok(Source { info, kind, level: Level::detect(), flat: None, planes })
     }
 
     /// A volume in memory. Panics if `voxels` does not have the shape's size or the shape is empty.
@@ -85,7 +90,9 @@ impl Source {
         let info = VolumeInfo::plain(shape, voxels.dtype(), "memory");
         let big = cfg!(target_endian = "big");
         let lattice = Lattice::dense(shape, voxels.dtype(), big, 0).expect("the voxels fit in memory");
-        Source { info, kind: Kind::Planar(Planar::memory(lattice, voxels)), level: Level::detect(), flat: None }
+        let planes = 0..info.shape[0];
+        let kind = Kind::Planar(Planar::memory(lattice, voxels));
+        Source { info, kind, level: Level::detect(), flat: None, planes }
     }
 
     /// A volume in memory, copied from an array of axes z, y, x in any memory order. Panics if it is empty.
@@ -136,11 +143,20 @@ impl Source {
         flat.absent_box(component, region).map(|fill| self.fill(fill))
     }
 
+    /// Says that no other planes (along z) will be read: [`Source::prepare`] unpacks no more than those.
+    pub fn narrow(&mut self, planes: Range<usize>) {
+        match &mut self.kind {
+            Kind::Planar(planar) => planar.narrow(planes),
+            Kind::Zarr(_) => self.planes = planes,
+            Kind::Synthetic(_) => {}
+        }
+    }
+
     /// Bytes of scratch disk that [`Source::prepare`] needs (0 for sources that are read in place).
     pub fn spool_bytes(&self) -> u64 {
         match &self.kind {
             Kind::Planar(planar) => planar.spool_bytes(),
-            Kind::Zarr(_) if matches!(self.flat, Some(None)) => flat::bytes(&self.info),
+            Kind::Zarr(_) if matches!(self.flat, Some(None)) => flat::bytes(&self.info, &self.planes),
             Kind::Zarr(_) | Kind::Synthetic(_) => 0,
         }
     }
@@ -152,7 +168,7 @@ impl Source {
         match &mut self.kind {
             Kind::Planar(planar) => planar.prepare(scratch, progress),
             Kind::Zarr(array) if matches!(self.flat, Some(None)) => {
-                self.flat = Some(Some(flat::run(array, &self.info, scratch, progress)?));
+                self.flat = Some(Some(flat::run(array, &self.info, &self.planes, scratch, progress)?));
                 Ok(())
             }
             Kind::Zarr(_) | Kind::Synthetic(_) => Ok(()),

@@ -1,12 +1,13 @@
 //! Volumes that are read by plain rows: mapped files, unpacked or re-blocked first where they are packed.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::bytes::{self, Files, MappedFile};
 use super::identity;
 use super::lattice::{Lattice, Planes};
 use super::reblock::Reblock;
-use super::spool::{Packed, Progress};
+use super::spool::{After, Packed, Progress};
 use crate::config::{Input, Select};
 use crate::grid::{AnyViewMut, Region};
 use crate::kernel::simd::Level;
@@ -80,14 +81,35 @@ impl Planar {
         }
     }
 
+    /// See [`super::Source::narrow`].
+    pub fn narrow(&mut self, planes: Range<usize>) {
+        match &mut self.pending {
+            Pending::Nothing => {}
+            Pending::Unpack(packed) => {
+                // A stream is unpacked from its start, but not to its end.
+                let len = self.lattice.end_of(&planes).unwrap_or(packed.len);
+                if len < packed.len {
+                    (packed.len, packed.after) = (len, After::Ignored);
+                }
+            }
+            Pending::Reblock(reblock) => {
+                let depth = self.lattice.shape[0];
+                reblock.wanted.retain(|plane| planes.contains(&(plane % depth)));
+            }
+        }
+    }
+
     pub fn prepare(&mut self, scratch: &Path, progress: Progress) -> Result<()> {
         let file = match &self.pending {
             Pending::Nothing => return Ok(()),
             Pending::Unpack(packed) => packed.unpack(scratch, progress)?,
             Pending::Reblock(reblock) => reblock.run(&self.paths, scratch, progress)?,
         };
-        let mapped = MappedFile::of(scratch, file)?;
         let need = self.lattice.ends(1).map_or(u64::MAX, |e| e[0]);
+        // Planes that nobody reads are holes.
+        let holes = file.metadata().and_then(|m| if m.len() < need { file.set_len(need) } else { Ok(()) });
+        holes.map_err(|e| Error::file(scratch, format!("scratch: {e}")))?;
+        let mapped = MappedFile::of(scratch, file)?;
         if mapped.len() < need {
             let text = format!("the scratch file has {} bytes, {need} are needed", mapped.len());
             return Err(Error::file(scratch, text));

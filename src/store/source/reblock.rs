@@ -17,6 +17,8 @@ use crate::{Error, Result};
 pub struct Reblock {
     /// File and image in it.
     pub pages: Vec<(u32, u32)>,
+    /// Planes to decode; the others stay holes.
+    pub wanted: Vec<usize>,
     pub width: usize,
     pub height: usize,
     pub dtype: DType,
@@ -72,16 +74,16 @@ impl Reblock {
         (self.width as u64 * self.height as u64).saturating_mul(self.dtype.size() as u64)
     }
 
-    /// Bytes of all planes.
+    /// Bytes of all planes to decode.
     pub fn bytes(&self) -> u64 {
-        self.plane().saturating_mul(self.pages.len() as u64)
+        self.plane().saturating_mul(self.wanted.len() as u64)
     }
 
     /// Decodes each strip or tile once into a nameless file in `scratch`.
     pub fn run(&self, paths: &[PathBuf], scratch: &Path, progress: Progress) -> Result<File> {
         let out = nameless(scratch, self.bytes())?;
         // In the order of the files, so that each directory is walked once.
-        let mut order: Vec<usize> = (0..self.pages.len()).collect();
+        let mut order = self.wanted.clone();
         order.sort_by_key(|i| self.pages[*i]);
         let mut open: Option<(u32, u32, Reader)> = None;
         let mut band = Vec::new();

@@ -415,6 +415,7 @@ fn place(
     }
     let reblock = Reblock {
         pages: picked.iter().map(|p| (p.file, p.image)).collect(),
+        wanted: (0..picked.len()).collect(),
         width: form.width as usize,
         height: form.height as usize,
         dtype: form.dtype,

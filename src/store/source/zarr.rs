@@ -16,6 +16,7 @@ use super::chunk_codecs;
 use super::planar::key;
 use super::planar::{components, shape_of};
 use super::shards::{Shard, Shards};
+use super::transposed;
 use super::units;
 use super::zarr_meta::{self, ArrayMeta, Multiscale, ShardMeta};
 use crate::brick::Voxels;
@@ -30,9 +31,12 @@ pub struct ZarrArray {
     folder: PathBuf,
     pub meta: ArrayMeta,
     array: Array<FilesystemStore>,
-    /// Codecs of an inner chunk.
+    /// Codecs of an inner chunk, but for a transposition.
     codecs: Arc<CodecChain>,
-    inner: Vec<NonZeroU64>,
+    /// Shape of an inner chunk as it is stored.
+    stored: Vec<NonZeroU64>,
+    /// Voxels from one to the next along each axis of a stored inner chunk; `None` where they are in the array's order.
+    strides: Option<Vec<usize>>,
     fill: f64,
     shards: Shards,
     /// Axes before the space axes, and each component's index along them.
@@ -270,7 +274,10 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
         let little = cfg!(target_endian = "little");
         if little { T::from_le_slice(bytes) } else { T::from_be_slice(bytes) }.to_f64()
     });
-    let inner = meta.inner.iter().filter_map(|n| NonZeroU64::new(*n)).collect();
+    let (codecs, order) = guarded(|| Ok(transposed::take(codecs))).map_err(failed)?;
+    let inner: Vec<NonZeroU64> = meta.inner.iter().filter_map(|n| NonZeroU64::new(*n)).collect();
+    let stored = order.as_ref().map_or(inner.clone(), |order| transposed::stored_shape(&inner, order));
+    let strides = order.map(|order| transposed::strides(&meta.inner, &order));
     let grid = std::array::from_fn(|a| shape[a].div_ceil(chunk[a]) as i64);
     let options = CodecOptions::default().with_concurrent_target(1);
     let shards = Shards::default();
@@ -285,7 +292,8 @@ pub fn open(input: &Input, path: &Path) -> Result<(VolumeInfo, ZarrArray)> {
             meta,
             array,
             codecs,
-            inner,
+            stored,
+            strides,
             fill,
             shards,
             lead,
@@ -366,7 +374,7 @@ impl ZarrArray {
         chunk_codecs::check_declared(&bytes, &unpacked, codecs).map_err(corrupt)?;
         let decoded = guarded(|| {
             let (kind, fill) = (self.array.data_type(), self.array.fill_value());
-            self.codecs.decode(Cow::Owned(bytes), &self.inner, kind, fill, &self.options).map_err(|e| e.to_string())
+            self.codecs.decode(Cow::Owned(bytes), &self.stored, kind, fill, &self.options).map_err(|e| e.to_string())
         })
         .map_err(corrupt)?;
         let ArrayBytes::Fixed(decoded) = decoded else { return Err(corrupt("not of one size per voxel".into())) };
@@ -375,17 +383,25 @@ impl ZarrArray {
         }
         // The selected time and channel inside the chunk.
         let lead = &self.meta.inner[..self.lead];
-        let part = self.components[component].iter().zip(lead).fold(0, |at, (i, c)| at * c + i % c);
-        let into = dst.as_bytes_mut();
+        let within = self.components[component].iter().zip(lead).map(|(i, c)| (i % c, c));
         let one = want / lead.iter().product::<u64>();
-        if into.len() as u64 != one || dst.dtype() != self.meta.dtype {
-            return Err(Error::Failed(format!(
-                "a buffer of {} voxels cannot hold a chunk of {}",
-                dst.len(),
-                one / size
-            )));
+        if dst.as_bytes().len() as u64 != one || dst.dtype() != self.meta.dtype {
+            let (have, chunk) = (dst.len(), one / size);
+            return Err(Error::Failed(format!("a buffer of {have} voxels cannot hold a chunk of {chunk}")));
         }
-        dst.as_bytes_mut().copy_from_slice(&decoded[(part * one) as usize..][..one as usize]);
+        let into = dst.as_bytes_mut();
+        match &self.strides {
+            None => {
+                let part = within.fold(0, |at, (i, c)| at * c + i);
+                into.copy_from_slice(&decoded[(part * one) as usize..][..one as usize]);
+            }
+            Some(strides) => {
+                let start = within.zip(strides).map(|((i, _), s)| i as usize * s).sum();
+                let mut along = [0; 3];
+                along[3 - (strides.len() - self.lead)..].copy_from_slice(&strides[self.lead..]);
+                transposed::copy_bytes(&decoded, size as usize, start, along, into, self.chunk());
+            }
+        }
         Ok(ChunkRead::Data { stored_bytes })
     }
 
