@@ -20,7 +20,7 @@ pub fn read(name: &str, node: &Node, names: &Names) -> Result<StageNode> {
         op: read_op(&r, names)?,
         border: border(&r)?,
         where_: r.node("where").map(|node| read_where(&r, node, names)).transpose()?,
-        fill: r.opt_number("fill")?,
+        fill: if takes(&r, "fill") { r.opt_number("fill")? } else { None },
         place: r.place,
     })
 }
@@ -45,10 +45,14 @@ fn op_word<'a>(key: &str, node: &'a Node) -> Result<&'a str> {
     }
 }
 
+/// Whether the stage's `op` has a key.
+fn takes(r: &Reader, key: &str) -> bool {
+    keys::of(Section::Stage, r.op).any(|k| k.name == key)
+}
+
 fn border(r: &Reader) -> Result<Border> {
-    let taken = keys::of(Section::Stage, r.op).any(|k| k.name == "border");
     match r.op {
-        _ if !taken => Ok(Border::Clip),
+        _ if !takes(r, "border") => Ok(Border::Clip),
         // Their rule is part of the formula; the key may only repeat it.
         "occlusion_map" => r.choice("border", &[("clip", Border::Clip)]),
         "gradient" | "saliency" => r.choice("border", &[("nearest", Border::Nearest)]),
