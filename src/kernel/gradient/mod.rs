@@ -372,48 +372,34 @@ fn across_columns<const H: usize, const L: usize, T: Voxel>(
     i: usize,
     gx: &mut [f64; L],
 ) {
-    *gx = [0.0; L];
+    let mut sums = [0.0; L];
     for dz in 0..=H {
         for dy in 0..=H {
             for dx in 1..=H {
-                // Voxels of one weight come together before they are weighed: where they cancel, nothing is left.
-                let mut sum = [0.0; L];
-                let columns = [i + H - dx, i + H + dx];
-                add_mirrored(rows[H + dz], H, dy, columns, missing, &mut sum);
-                if dz > 0 {
-                    add_mirrored(rows[H - dz], H, dy, columns, missing, &mut sum);
+                // Voxels of one weight come together before they are weighed, in mirrored pairs: where they cancel, nothing is left.
+                let mut of_weight = [0.0; L];
+                for z in [H + dz, H - dz].into_iter().take(1 + usize::from(dz > 0)) {
+                    let mut of_plane = [0.0; L];
+                    for y in [H + dy, H - dy].into_iter().take(1 + usize::from(dy > 0)) {
+                        let before: &[T; L] = rows[z][y][i + H - dx..][..L].try_into().unwrap();
+                        let behind: &[T; L] = rows[z][y][i + H + dx..][..L].try_into().unwrap();
+                        for l in 0..L {
+                            of_plane[l] +=
+                                <f64 as Sum<T>>::of(behind[l], missing) - <f64 as Sum<T>>::of(before[l], missing);
+                        }
+                    }
+                    for l in 0..L {
+                        of_weight[l] += of_plane[l];
+                    }
                 }
                 let w = table.along[2][dz][dy][dx];
                 for l in 0..L {
-                    gx[l] += w * sum[l];
+                    sums[l] += w * of_weight[l];
                 }
             }
         }
     }
-}
-
-/// Adds the differences of `L` voxels in two columns of the rows `dy` above and below the middle one, the rows' sum first.
-#[inline(always)]
-fn add_mirrored<'r, const L: usize, T: Voxel>(
-    rows: [&'r [T]; 5],
-    middle: usize,
-    dy: usize,
-    [before, behind]: [usize; 2],
-    missing: Option<T>,
-    sum: &mut [f64; L],
-) {
-    let lanes = |row: &'r [T], first: usize| -> &'r [T; L] { row[first..][..L].try_into().unwrap() };
-    let [above, below] = [rows[middle + dy], rows[middle - dy]];
-    let (a, b) = (lanes(above, behind), lanes(above, before));
-    let (c, d) = (lanes(below, behind), lanes(below, before));
-    let of = <f64 as Sum<T>>::of;
-    for l in 0..L {
-        let mut difference = of(a[l], missing) - of(b[l], missing);
-        if dy > 0 {
-            difference += of(c[l], missing) - of(d[l], missing);
-        }
-        sum[l] += difference;
-    }
+    *gx = sums;
 }
 
 /// The three components (z, y, x in turn, [`RUN`] apart) from the weighted columns; past the run's end they are rubbish.
