@@ -220,7 +220,6 @@ impl<W: Send> Stream<'_, W> {
             }
             self.trace.span("write", start, &[("brick", format!("{:?}", work.brick))]);
             drop(permit);
-            self.metrics.sample_memory();
             (self.stations.tick)();
         }
     }

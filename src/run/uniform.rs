@@ -104,12 +104,12 @@ impl Assembler<'_> {
             let view = filled.get_or_insert_with(voxels).view(region.shape());
             self.put(place, k, region, view, items)?;
         } else {
-            let empty = sink.encode_uniform(voxel)? == Encoded::Empty;
+            let encoded = sink.encode_uniform(voxel)?;
             for index in region.cells([0; 3], output.spec.chunk).iter() {
                 let cell = Region::of_cell(index, [0; 3], output.spec.chunk);
                 let chunk = cell.clip(&whole);
-                if region.contains(&cell) || empty && region.contains(&chunk) {
-                    push(chunk, sink.encode_uniform(voxel)?);
+                if region.contains(&cell) || encoded == Encoded::Empty && region.contains(&chunk) {
+                    push(chunk, encoded.clone());
                     continue;
                 }
                 let part = chunk.clip(&region);

@@ -46,7 +46,7 @@ enum Target {
     Stage(usize, &'static str),
 }
 
-/// Lowers everything that the outputs read. `infos` are the facts of the config's inputs, in order.
+/// Lowers everything that the outputs read; halos come with the outputs. `infos` are the facts of the config's inputs, in order.
 pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
     let mut lowering =
         Lowering { config, infos, out: Lowered::default(), wanted: vec![Vec::new(); config.stages.len()] };
@@ -71,7 +71,6 @@ pub fn lower(config: &Config, infos: &[VolumeInfo]) -> Result<Lowered> {
         }
     }
     forget_mirrors(&mut lowering.out.graph);
-    lowering.out.graph.demand_halos();
     Ok(lowering.out)
 }
 
